@@ -1,0 +1,80 @@
+"""The geometry of a scene: what every reader and mesher makes, and what the model is built from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpitled.errors import InputError
+from mpitled.material import Material
+
+#: Corners of the reference hexahedron in the Abaqus/VTK order (paper, eq. 4.4).
+CORNERS = np.array(
+    [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Constraint:
+    """Nodes held (displacement 0) or moved along the loading curve, in the named directions only."""
+
+    node_set: str
+    directions: tuple[int, ...]  # of 0, 1, 2
+    displacement: tuple[float, ...]  # m at full load, one for each direction; 0 where fixed
+    origin: str = ""  # file and line or key, for messages
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """Nodes, hexahedra and integration points in metres; FE nodes first, then EFG nodes (paper, 4.1.2).
+
+    Cells are hexahedra first, then integration points: cell sets index into that list.
+    """
+
+    points: NDArray[np.float64]  # (n_nodes, 3), m
+    n_fe_nodes: int  # rows of `points` that hexahedra use
+    hexahedra: NDArray[np.int64]  # (n_hexahedra, 8), Abaqus/VTK order
+    integration_points: NDArray[np.float64]  # (n_integration, 3), m
+    integration_volumes: NDArray[np.float64]  # (n_integration,), m^3
+    node_sets: dict[str, NDArray[np.int64]]  # name -> ascending nodes
+    cell_sets: dict[str, NDArray[np.int64]]  # name -> ascending cells
+    node_ids: NDArray[np.int64]  # (n_nodes,), numbers in the file that the nodes came from
+    materials: dict[str, Material] = field(default_factory=dict)  # cell set -> material, where the file says so
+    constraints: tuple[Constraint, ...] = ()  # where the file says so
+    remarks: tuple[str, ...] = ()  # what the reader skipped, merged or repaired, a line each
+    figures: dict[str, float] = field(default_factory=dict)  # e.g. void_volume_m3
+
+    @property
+    def n_nodes(self) -> int:
+        return len(self.points)
+
+    @property
+    def n_cells(self) -> int:
+        return len(self.hexahedra) + len(self.integration_points)
+
+
+def structured_hexahedra(shape: tuple[int, int, int]) -> NDArray[np.int64]:
+    """Hexahedra (n, 8) of a grid of (nx, ny, nz) cells whose nodes are numbered along x, then y, then z."""
+    nx, ny, nz = shape
+    lines = np.array([1, nx + 1, (nx + 1) * (ny + 1)])
+    k, j, i = np.meshgrid(np.arange(nz), np.arange(ny), np.arange(nx), indexing="ij")
+    first = (i * lines[0] + j * lines[1] + k * lines[2]).ravel()
+    return first[:, None] + ((CORNERS + 1) // 2) @ lines
+
+
+def grid_points(shape: tuple[int, int, int], size: tuple[float, float, float]) -> NDArray[np.float64]:
+    """Nodes (n, 3), in m, of a grid of (nx, ny, nz) cells that fills [0, size]; x runs fastest."""
+    axes = [np.linspace(0.0, length, n + 1) for n, length in zip(shape, size, strict=True)]
+    z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
+    return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+
+
+def named_set(sets: dict[str, NDArray[np.int64]], name: str, origin: str) -> NDArray[np.int64]:
+    """The set of that name; an InputError that lists the sets there are, if there is none or it is empty."""
+    if name not in sets:
+        raise InputError(f"{origin}: there is no set '{name}'; sets: {', '.join(sorted(sets)) or 'none'}")
+    if len(sets[name]) == 0:
+        raise InputError(f"{origin}: the set '{name}' is empty")
+    return sets[name]
