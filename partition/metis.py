@@ -1,0 +1,56 @@
+"""Cuts the graph of cells into parts of equal cost with METIS (Karypis and Kumar 1998)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from partition.graph import CellGraph
+
+#: METIS's tolerance: the dearest part costs at most 1 + IMBALANCE / 1000 of the mean, up to the cost of one cell.
+IMBALANCE = 5
+
+#: METIS counts in integers: the cost of the cheaper kind of cell in them, hence costs are right to 0.5 %.
+COST_UNITS = 100
+
+
+def cut(graph: CellGraph, n_parts: int, weights: tuple[float, float], seed: int = 0) -> NDArray[np.int32]:
+    """The part of each cell, (n_cells,): parts of equal cost that few edges join.
+
+    `weights` are the costs of a hexahedron and of a support domain, in any unit. The same graph, weights and seed give
+    the same parts. Where the graph is connected so is each part, unless METIS left one empty, which then gets a
+    cell of the dearest. ValueError where there are fewer cells than parts or a cost is not positive.
+    """
+    if n_parts < 1:
+        raise ValueError(f"cannot cut into {n_parts} parts: at least 1 is needed")
+    if n_parts > graph.n_cells:
+        raise ValueError(f"cannot cut {graph.n_cells} cells into {n_parts} parts: take at most one part for each cell")
+    if not (min(weights) > 0 and np.isfinite(weights).all()):
+        raise ValueError(f"cell costs must be positive numbers, not {weights[0]} and {weights[1]}")
+    if n_parts == 1:
+        return np.zeros(graph.n_cells, dtype=np.int32)
+    import pymetis
+
+    integer = pymetis.zero_copy_dtype()
+    units = np.rint(np.array(weights) / min(weights) * COST_UNITS).astype(integer)
+    cost = np.repeat(units, [graph.n_hexahedra, graph.n_cells - graph.n_hexahedra])
+    if cost.sum(dtype=np.float64) + 2 * graph.adjncy.size > np.iinfo(integer).max:
+        raise ValueError(f"{graph.n_cells} cells are too many for this METIS, which counts in {integer}")
+    part = pymetis.part_graph(
+        n_parts,
+        pymetis.CSRAdjacency(graph.xadj.astype(integer, copy=False), graph.adjncy.astype(integer, copy=False)),
+        vweights=cost,
+        eweights=None if graph.shared is None else graph.shared.astype(integer, copy=False),
+        recursive=False,  # only the k-way scheme keeps parts connected
+        options=pymetis.Options(seed=seed, contig=int(graph.connected), ufactor=IMBALANCE),
+    ).vertex_part
+    return _without_empty_parts(np.array(part, dtype=np.int32), cost, n_parts)
+
+
+def _without_empty_parts(part: NDArray[np.int32], cost: NDArray[np.integer], n_parts: int) -> NDArray[np.int32]:
+    """Gives each empty part the last cell of the dearest part that has more than one."""
+    for empty in np.flatnonzero(np.bincount(part, minlength=n_parts) == 0):
+        size = np.bincount(part, minlength=n_parts)
+        dearest = np.argmax(np.where(size > 1, np.bincount(part, cost, minlength=n_parts), 0))
+        part[np.flatnonzero(part == dearest)[-1]] = empty
+    return part

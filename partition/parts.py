@@ -1,0 +1,180 @@
+"""What each part consists of: cells, nodes, neighbours and the nodes shared with them; and figures of its quality."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from partition.graph import CellGraph
+
+
+@dataclass(frozen=True, slots=True)
+class PartTables:
+    """All parts one after another; offsets say where each begins. Global node and cell numbers.
+
+    A cell is in one part. A node is in each part whose cells touch it; the lowest of these owns it.
+    """
+
+    n_parts: int
+    cells: NDArray[np.int64]  # (n_cells,), by part, ascending in each
+    cell_offsets: NDArray[np.int64]  # (n_parts + 1,), into cells
+    nodes: NDArray[np.int64]  # (sum of nodes,), by part, ascending in each
+    node_offsets: NDArray[np.int64]  # (n_parts + 1,), into nodes
+    owned_offsets: NDArray[np.int64]  # (n_parts + 1,), running number of nodes that the parts own
+    neighbours: NDArray[np.int32]  # (sum of neighbours,), parts, by part, ascending in each
+    neighbour_offsets: NDArray[np.int64]  # (n_parts + 1,), into neighbours
+    shared: NDArray[np.int64]  # (sum of shared nodes,), by part and neighbour, ascending in each
+    shared_offsets: NDArray[np.int64]  # (len(neighbours) + 1,), into shared
+
+
+def tables(
+    hexahedra: NDArray[np.int64], domains: NDArray[np.int64], part: NDArray[np.int32], n_parts: int
+) -> PartTables:
+    """The tables of a partition `part` (n_cells,) of hexahedra (n, 8) and support domains (m, k), given by their nodes.
+
+    Nodes that no cell touches are in no part.
+    """
+    hexahedra = np.ascontiguousarray(hexahedra, dtype=np.int64).reshape(-1, 8)
+    domains = np.ascontiguousarray(domains, dtype=np.int64)
+    n_nodes = 1 + max(int(hexahedra.max(initial=-1)), int(domains.max(initial=-1)))
+    cells = np.argsort(part, kind="stable")
+    cell_offsets = _offsets(np.bincount(part, minlength=n_parts))
+    counts = _touched_nodes(hexahedra, domains, cells, cell_offsets, n_nodes, np.empty(0, np.int64))
+    node_offsets = _offsets(counts)
+    nodes = np.empty(node_offsets[-1], np.int64)
+    _touched_nodes(hexahedra, domains, cells, cell_offsets, n_nodes, nodes)
+    for p in range(n_parts):
+        nodes[node_offsets[p] : node_offsets[p + 1]].sort()
+
+    n_touching = np.bincount(nodes, minlength=n_nodes)
+    at_border = n_touching[nodes] > 1
+    border_nodes = nodes[at_border]
+    border_parts = np.repeat(np.arange(n_parts), counts)[at_border]
+    order = np.argsort(border_nodes, kind="stable")
+    border_nodes, border_parts = border_nodes[order], border_parts[order]
+    first = np.concatenate([[True], border_nodes[1:] != border_nodes[:-1]])[: len(border_nodes)]
+    owned = np.bincount(border_parts[first], minlength=n_parts) + counts
+    owned -= np.bincount(border_parts, minlength=n_parts)
+
+    # Each copy of a border node meets all copies of that node, which lie side by side.
+    copies = n_touching[border_nodes]
+    me = np.repeat(np.arange(len(border_nodes)), copies)
+    start = np.maximum.accumulate(np.where(first, np.arange(len(border_nodes)), 0))
+    other = start[me] + np.arange(len(me)) - _offsets(copies)[me]
+    me, other = me[me != other], other[me != other]
+    link = border_parts[me] * n_parts + border_parts[other]
+    order = np.argsort(link, kind="stable")
+    links, n_shared = np.unique(link, return_counts=True)
+    return PartTables(
+        n_parts=n_parts,
+        cells=cells,
+        cell_offsets=cell_offsets,
+        nodes=nodes,
+        node_offsets=node_offsets,
+        owned_offsets=_offsets(owned),
+        neighbours=(links % n_parts).astype(np.int32),
+        neighbour_offsets=_offsets(np.bincount(links // n_parts, minlength=n_parts)),
+        shared=border_nodes[me[order]],
+        shared_offsets=_offsets(n_shared),
+    )
+
+
+def _offsets(counts: NDArray[np.integer]) -> NDArray[np.int64]:
+    return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+
+
+@njit(cache=True)
+def _touched_nodes(hexahedra, domains, cells, cell_offsets, n_nodes, nodes):  # type: ignore[no-untyped-def]
+    """The number of nodes that each part's cells touch; fills `nodes` with them by part, unless it is empty."""
+    last = np.full(n_nodes, -1)
+    counts = np.zeros(len(cell_offsets) - 1, np.int64)
+    n = 0
+    for p in range(len(counts)):
+        for c in cells[cell_offsets[p] : cell_offsets[p + 1]]:
+            for node in hexahedra[c] if c < len(hexahedra) else domains[c - len(hexahedra)]:
+                if last[node] != p:
+                    last[node] = p
+                    if len(nodes):
+                        nodes[n] = node
+                    n += 1
+                    counts[p] += 1
+    return counts
+
+
+@dataclass(frozen=True, slots=True)
+class PartFigures:
+    """How good a partition is, part by part."""
+
+    hexahedra: NDArray[np.int64]  # (n_parts,)
+    domains: NDArray[np.int64]  # (n_parts,)
+    cost: NDArray[np.float64]  # (n_parts,), in the unit of the weights
+    nodes: NDArray[np.int64]  # (n_parts,), shared ones included
+    halo_nodes: NDArray[np.int64]  # (n_parts,), nodes that other parts touch too
+    sent_nodes: NDArray[np.int64]  # (n_parts,), sent in an exchange: halo nodes, once to each part that has them
+    neighbours: NDArray[np.int64]  # (n_parts,)
+    cut: NDArray[np.int64] | None  # (n_parts,), edges of the graph that leave the part
+
+    @property
+    def cells(self) -> NDArray[np.int64]:
+        """Cells of each part, (n_parts,)."""
+        return self.hexahedra + self.domains
+
+    @property
+    def balance(self) -> float:
+        """Cost of the dearest part over the mean: the time of a step over that of a perfect partition."""
+        return float(self.cost.max() / self.cost.mean())
+
+    def describe(self, most: int = 32) -> str:
+        """A table with a line for each part, for at most `most` parts, then the mean and the largest, and a summary."""
+        columns = {
+            "cells": self.cells,
+            "hexahedra": self.hexahedra,
+            "domains": self.domains,
+            "cost/mean": self.cost / self.cost.mean(),
+            "nodes": self.nodes,
+            "halo nodes": self.halo_nodes,
+            "neighbours": self.neighbours,
+        }
+        if self.cut is not None:
+            columns["cut edges"] = self.cut
+        n_parts = len(self.cost)
+        rows = {str(p): [values[p] for values in columns.values()] for p in range(n_parts if n_parts <= most else 0)}
+        rows["mean"] = [values.mean() for values in columns.values()]
+        rows["largest"] = [values.max() for values in columns.values()]
+        lines = ["part".rjust(8) + "".join(name.rjust(12) for name in columns)]
+        for label, row in rows.items():
+            texts = [f"{x:.4f}" if name == "cost/mean" else f"{x:.0f}" for name, x in zip(columns, row, strict=True)]
+            lines.append(label.rjust(8) + "".join(text.rjust(12) for text in texts))
+        summary = f"{n_parts} parts: balance {self.balance:.4f} (largest/mean cost)"
+        if self.cut is not None:
+            summary += f", {self.cut.sum() // 2} edges cut"
+        return "\n".join([*lines, summary])
+
+
+def figures(
+    tables: PartTables, weights: tuple[float, float], n_hexahedra: int, graph: CellGraph | None = None
+) -> PartFigures:
+    """Figures of a partition whose cells cost `weights` (a hexahedron, a support domain); cut edges with the graph."""
+    sizes = np.diff(tables.cell_offsets)
+    part = np.empty(len(tables.cells), dtype=np.int32)
+    part[tables.cells] = np.repeat(np.arange(tables.n_parts, dtype=np.int32), sizes)
+    hexahedra = np.bincount(part[:n_hexahedra], minlength=tables.n_parts)
+    n_touching = np.bincount(tables.nodes)
+    of_node = np.repeat(np.arange(tables.n_parts), np.diff(tables.node_offsets))
+    cut = None
+    if graph is not None:
+        crossing = np.repeat(part, np.diff(graph.xadj))
+        cut = np.bincount(crossing[crossing != part[graph.adjncy]], minlength=tables.n_parts)
+    return PartFigures(
+        hexahedra=hexahedra,
+        domains=sizes - hexahedra,
+        cost=weights[0] * hexahedra + weights[1] * (sizes - hexahedra),
+        nodes=np.diff(tables.node_offsets),
+        halo_nodes=np.bincount(of_node[n_touching[tables.nodes] > 1], minlength=tables.n_parts),
+        sent_nodes=np.diff(tables.shared_offsets[tables.neighbour_offsets]),
+        neighbours=np.diff(tables.neighbour_offsets),
+        cut=cut,
+    )
