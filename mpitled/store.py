@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import h5py
@@ -25,10 +26,13 @@ if TYPE_CHECKING:
 #: Written into every model; a file of another layout is built anew, never read by guess.
 MODEL_LAYOUT = 1
 
-#: Bytes that are read over rather than skipped: about what one more call of HDF5 costs.
-_GAP_BYTES = 1 << 16
-#: Bytes held at most at a time beside what is asked for.
-_BLOCK_BYTES = 1 << 24
+#: A file of results of another layout is refused too.
+RESULT_LAYOUT = 1
+
+#: Bytes that are read over rather than skipped: about what one more call of HDF5 costs (70 us at 3.5 GB/s).
+_GAP_BYTES = 1 << 18
+#: Bytes held at most at a time beside what is asked for; stays in the cache.
+_BLOCK_BYTES = 1 << 22
 
 _MODEL_ARRAYS = {
     "points": np.float64,
@@ -111,17 +115,14 @@ def _open_model(path: Path) -> Iterator[h5py.File]:
         yield file
 
 
-@contextmanager
-def _open(path: Path) -> Iterator[h5py.File]:
+def _open(path: Path) -> h5py.File:
     # No locks: every rank reads the same file, and network file systems often refuse them.
     try:
-        file = h5py.File(path, "r", locking=False)
+        return h5py.File(path, "r", locking=False)
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read as HDF5 ({str(error).splitlines()[0]})") from None
-    with file:
-        yield file
 
 
 @contextmanager
@@ -226,6 +227,7 @@ class PartRows:
     n_domains: int  # of the whole model
     cells: NDArray[np.int64]  # (n,) ascending: this part's hexahedra, then its support domains
     nodes: NDArray[np.int64]  # (k,) ascending nodes that these cells touch
+    node_ids: NDArray[np.int64]  # (k,) numbers in the file that the nodes came from
     rows: NDArray[np.int64]  # (k,) row of each node in the result files
     owned: NDArray[np.bool_]  # (k,)
     first_row: int  # row of the first owned node; owned nodes follow each other
@@ -288,6 +290,7 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
             n_domains=n_domains,
             cells=cells,
             nodes=nodes,
+            node_ids=read_rows(file["node_ids"], nodes),
             rows=rows,
             owned=(rows >= first_row) & (rows < end_row),
             first_row=int(first_row),
@@ -321,14 +324,17 @@ def read_rows(dataset: h5py.Dataset, rows: NDArray[np.int64]) -> NDArray[Any]:
     if values.size == 0:
         return values
     row_bytes = values.itemsize * int(np.prod(dataset.shape[1:]))
-    block = rows // max(1, _BLOCK_BYTES // row_bytes)
+    buffer = np.empty((max(1, _BLOCK_BYTES // row_bytes), *dataset.shape[1:]), dataset.dtype)
+    block = rows // len(buffer)
     breaks = np.flatnonzero((np.diff(rows) > _GAP_BYTES // row_bytes + 1) | (np.diff(block) > 0)) + 1
     for first, last in zip([0, *breaks], [*breaks, len(rows)], strict=True):
         start, stop = int(rows[first]), int(rows[last - 1]) + 1
         if stop - start == last - first:
             dataset.read_direct(values, np.s_[start:stop], np.s_[first:last])
         else:
-            values[first:last] = dataset[start:stop][rows[first:last] - start]
+            dataset.read_direct(buffer, np.s_[start:stop], np.s_[: stop - start])
+            # A mode other than "raise" lets numpy write into `out` without a copy.
+            np.take(buffer, rows[first:last] - start, axis=0, out=values[first:last], mode="clip")
     return values
 
 
@@ -350,3 +356,360 @@ def _matching(
         values.append(some[here])
         rows.append(start + here)
     return np.concatenate(values), np.concatenate(rows)
+
+
+# --- results -----------------------------------------------------------------------------------------------------
+
+_FINISHED, _UNFINISHED = "result.vtkhdf", "result.partial.vtkhdf"
+_VTK_VERTEX, _VTK_HEXAHEDRON = 1, 12
+_HEXAHEDRON, _EFG_NODE, _INTEGRATION_POINT = 0, 1, 2
+
+
+class ResultWriter:
+    """Writes `result.vtkhdf`: a VTKHDF unstructured grid with steps, one piece for the whole mesh, in parallel.
+
+    Points are the owned nodes of rank 0, 1, ... and then the integration points of rank 0, 1, ...; cells are
+    hexahedra, a vertex for each EFG node, and a vertex for each integration point, each kind by rank. The mesh is
+    written once, undeformed. Every method is collective. Until `close` the file is named `result.partial.vtkhdf`,
+    and at any time it can be read with all the frames that are finished.
+
+    VTKHDF: https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format/vtkhdf_specifications.html
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        comm: Any,
+        part: PartRows,
+        n_frames: int,
+        metadata: Mapping[str, Any],
+        *,
+        point_data: Mapping[str, int] = MappingProxyType({"displacement": 3, "field_displacement": 3}),
+        cell_data: Mapping[str, int] = MappingProxyType({"J": 1}),
+        series: Sequence[str] = (),
+    ) -> None:
+        """Write the mesh and make room for `n_frames` frames.
+
+        `comm` is an MPI communicator whose ranks are the parts in order, or None. `metadata` is what JSON can hold;
+        rank 0's is kept. `point_data` and `cell_data` give the components of what each frame holds; `series` names
+        the numbers of each frame. InputError if the file cannot be made.
+        """
+        if comm is not None and comm.size == 1:
+            comm = None
+        self._comm, self._part, self._n_frames, self._frame = comm, part, n_frames, 0
+        self._announced = {*point_data, *cell_data, *series}
+        self._path = Path(directory) / _FINISHED
+        self._partial = Path(directory) / _UNFINISHED
+        self._transfer = None
+        try:
+            if self._leads:
+                Path(directory).mkdir(parents=True, exist_ok=True)
+            if comm is None:
+                self._file = h5py.File(self._partial, "w", locking=False)
+            else:
+                comm.barrier()
+                self._transfer = h5py.h5p.create(h5py.h5p.DATASET_XFER)
+                self._transfer.set_dxpl_mpio(h5py.h5fd.MPIO_COLLECTIVE)
+                self._file = h5py.File(self._partial, "w", driver="mpio", comm=comm)
+        except OSError as error:
+            raise InputError(f"{self._partial}: cannot be written ({str(error).splitlines()[0]})") from None
+        self._write_mesh()
+        self._make_steps(point_data, cell_data, series)
+        ours = self._file.create_group("mpitled")
+        ours.attrs["layout"] = RESULT_LAYOUT
+        self._note("metadata", metadata)
+        self._file.flush()
+
+    @property
+    def _leads(self) -> bool:
+        return self._comm is None or self._comm.rank == 0
+
+    def write_frame(
+        self,
+        time: float,
+        point_data: Mapping[str, NDArray[np.float64]],
+        cell_data: Mapping[str, NDArray[np.float64]],
+        series: Mapping[str, float] | None = None,
+    ) -> None:
+        """Write one frame; it counts once it is on its way to the disc.
+
+        Point data: (owned nodes + own support domains, components), nodes ascending, then integration points.
+        Cell data: (own cells, components) in the order of `PartRows.cells`. Rank 0's time (s) and series are kept.
+        """
+        if self._frame == self._n_frames:
+            raise ValueError(f"{self._n_frames} frames were announced, and one more is written")
+        if {*point_data, *cell_data, *(series or {})} != self._announced:
+            raise ValueError(f"every frame holds {', '.join(sorted(self._announced))}")
+        grid, steps = self._file["VTKHDF"], self._file["VTKHDF/Steps"]
+        for name, values in point_data.items():
+            self._write(grid["PointData"][name], self._point_slabs, values, self._frame * self._n_points)
+        for name, values in cell_data.items():
+            self._write(
+                grid["CellData"][name], self._cell_slabs, self._with_efg(values, np.nan), self._frame * self._n_cells
+            )
+        if self._leads:
+            for name, value in (series or {}).items():
+                grid["FieldData"][name][self._frame] = value
+        self._file.flush()
+        self._frame += 1
+        steps.attrs.modify("NSteps", np.int64(self._frame))
+        self._file.flush()
+        # VTK reads all times into room for NSteps: there must never be more of them.
+        steps["Values"].resize((self._frame,))
+        if self._leads:
+            steps["Values"][self._frame - 1] = time
+        self._file.flush()
+
+    def close(self, figures: Mapping[str, Any] | None = None) -> None:
+        """End the file with rank 0's figures of the run (what JSON can hold) and give it its name."""
+        self.abandon(figures)
+        if self._leads:
+            _fsync(self._partial)
+            os.replace(self._partial, self._path)
+            _fsync(self._path.parent)
+        if self._comm is not None:
+            self._comm.barrier()
+
+    def abandon(self, figures: Mapping[str, Any] | None = None) -> None:
+        """End the file as it is; it keeps the name of an unfinished one and can be read."""
+        self._note("figures", figures or {})
+        self._file.close()
+
+    def _note(self, name: str, value: Mapping[str, Any]) -> None:
+        # Made alike on all ranks, as HDF5 demands of whatever makes a dataset.
+        _write_json(self._file["mpitled"], name, value if self._comm is None else self._comm.bcast(dict(value)))
+
+    def _write_mesh(self) -> None:
+        part = self._part
+        owned = part.owned
+        efg = owned & (part.nodes >= part.n_fe_nodes)
+        counts = np.array([owned.sum(), len(part.hexahedra), efg.sum(), len(part.domains)])
+        by_rank = np.array([counts] if self._comm is None else self._comm.allgather(counts))
+        totals, before = by_rank.sum(axis=0), by_rank[: part.part].sum(axis=0)
+        self._n_efg = int(counts[2])
+        self._n_points, self._n_cells = int(totals[[0, 3]].sum()), int(totals[1:].sum())
+        self._point_slabs = _slabs(totals[[0, 3]], before[[0, 3]], counts[[0, 3]])
+        self._cell_slabs = _slabs(totals[1:], before[1:], counts[1:])
+        sizes = np.array([8, 1, 1])
+        corner_slabs = _slabs(sizes * totals[1:], sizes * before[1:], sizes * counts[1:])
+        integration_rows = totals[0] + before[3] + np.arange(counts[3])
+        corners = part.rows[np.searchsorted(part.nodes, part.hexahedra)].ravel()
+        # Offsets say where each cell's corners end, after a first row that says where they begin.
+        ends = [
+            first + size * np.arange(1, n // size + 1) for (first, n), size in zip(corner_slabs, sizes, strict=True)
+        ]
+        end_slabs = [(first + 1, n) for first, n in self._cell_slabs]
+        if part.part == 0:
+            ends, end_slabs = [np.zeros(1, np.int64), *ends], [(0, 1), *end_slabs]
+
+        grid = self._file.create_group("VTKHDF")
+        grid.attrs["Version"] = np.array([2, 0])
+        grid.attrs["Type"] = np.bytes_("UnstructuredGrid")
+        n_corners = int((sizes * totals[1:]).sum())
+        self._table(grid, "NumberOfPoints", [self._n_points])
+        self._table(grid, "NumberOfCells", [self._n_cells])
+        self._table(grid, "NumberOfConnectivityIds", [n_corners])
+
+        def write(name: str, slabs: _Slabs, n_rows: int, values: NDArray[Any]) -> None:
+            self._write(_make(grid, name, (n_rows, *values.shape[1:]), values.dtype), slabs, values)
+
+        points = np.concatenate([part.points[owned], part.domain_points])
+        write("Points", self._point_slabs, self._n_points, points)
+        write("Connectivity", corner_slabs, n_corners, np.concatenate([corners, part.rows[efg], integration_rows]))
+        write("Offsets", end_slabs, self._n_cells + 1, np.concatenate(ends))
+        kinds = np.repeat(np.array([_HEXAHEDRON, _EFG_NODE, _INTEGRATION_POINT], np.uint8), counts[1:])
+        types = np.where(kinds == _HEXAHEDRON, _VTK_HEXAHEDRON, _VTK_VERTEX).astype(np.uint8)
+        write("Types", self._cell_slabs, self._n_cells, types)
+        none = np.full(counts[3], -1)
+        for name, of_nodes in (("node_id", part.nodes), ("node_label", part.node_ids)):
+            write(f"PointData/{name}", self._point_slabs, self._n_points, np.concatenate([of_nodes[owned], none]))
+        for name, of_cells in (
+            ("cell_id", self._with_efg(part.cells, -1)),
+            ("material", self._with_efg(part.material, -1)),
+            ("kind", kinds),
+            ("part", np.full(len(kinds), part.part, np.int32)),
+        ):
+            write(f"CellData/{name}", self._cell_slabs, self._n_cells, of_cells)
+
+    def _make_steps(self, point_data: Mapping[str, int], cell_data: Mapping[str, int], series: Sequence[str]) -> None:
+        n = self._n_frames
+        grid = self._file["VTKHDF"]
+        steps = grid.create_group("Steps")
+        steps.attrs["NSteps"] = np.int64(0)
+        # One row at first, so that its one chunk has its place in the file; later only the extent changes.
+        values = _make(steps, "Values", (1,), np.float64, maxshape=(n,), chunks=(n,))
+        if self._leads:
+            values[...] = 0.0
+        self._table(steps, "NumberOfParts", np.ones(n))
+        # The mesh, and what is said of it, is the same in every step: all offsets into it are 0.
+        for name, shape in (
+            ("PartOffsets", n),
+            ("PointOffsets", n),
+            ("CellOffsets", (n, 1)),
+            ("ConnectivityIdOffsets", (n, 1)),
+        ):
+            self._table(steps, name, np.zeros(shape))
+        for kind, n_rows, components in (("Point", self._n_points, point_data), ("Cell", self._n_cells, cell_data)):
+            data, offsets = grid[f"{kind}Data"], steps.create_group(f"{kind}DataOffsets")
+            for name in data:
+                self._table(offsets, name, np.zeros(n))
+            for name, width in components.items():
+                _make(data, name, (n * n_rows, width)[: 1 + (width > 1)], np.float64)
+                self._table(offsets, name, n_rows * np.arange(n))
+        for name in series:
+            numbers = _make(grid, f"FieldData/{name}", (n,), np.float64)
+            if self._leads:
+                numbers[...] = np.nan
+            self._table(steps, f"FieldDataOffsets/{name}", np.arange(n))
+            self._table(steps, f"FieldDataSizes/{name}", np.ones((n, 2)))
+
+    def _with_efg(self, values: NDArray[Any], filler: float) -> NDArray[Any]:
+        """Values of own cells with `filler` for the vertices of EFG nodes, which are no cells of the model."""
+        between = np.full((self._n_efg, *values.shape[1:]), filler, values.dtype)
+        n_hexahedra = len(self._part.hexahedra)
+        return np.concatenate([values[:n_hexahedra], between, values[n_hexahedra:]])
+
+    def _table(self, group: h5py.Group, name: str, values: Any) -> None:
+        """A small dataset of integers that all ranks make and the first writes."""
+        dataset = _make(group, name, np.shape(values), np.int64)
+        if self._leads:
+            dataset[...] = values
+
+    def _write(self, dataset: h5py.Dataset, slabs: _Slabs, values: NDArray[Any], first_row: int = 0) -> None:
+        """Write the rows of this rank in one collective call, which a rank without rows makes as well."""
+        shape = (sum(count for _, count in slabs), *dataset.shape[1:])
+        if values.shape != shape:
+            raise ValueError(f"{dataset.name}: {values.shape} values for rows of shape {shape}")
+        values = np.ascontiguousarray(values, dataset.dtype)
+        space, memory = dataset.id.get_space(), h5py.h5s.create_simple(shape)
+        space.select_none()
+        for start, count in slabs:
+            if count:
+                start_of_slab = (first_row + start, *(0 for _ in shape[1:]))
+                space.select_hyperslab(start_of_slab, (count, *shape[1:]), op=h5py.h5s.SELECT_OR)
+        if not values.size:
+            memory.select_none()
+        dataset.id.write(memory, space, values, dxpl=self._transfer)
+
+
+_Slabs = list[tuple[int, int]]
+
+
+def _slabs(totals: NDArray[np.int64], before: NDArray[np.int64], counts: NDArray[np.int64]) -> _Slabs:
+    """First row and count of this rank in each of several lists that follow each other in one dataset."""
+    firsts = np.cumsum([0, *totals[:-1]]) + before
+    return list(zip(firsts.tolist(), counts.tolist(), strict=True))
+
+
+def _make(group: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any, **options: Any) -> h5py.Dataset:
+    """A dataset, contiguous unless told otherwise, with its room on disc from the start.
+
+    A run that is killed then keeps what it wrote; resizable data were lost.
+    """
+    properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    properties.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    properties.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    return group.create_dataset(name, shape, dtype, dcpl=properties, **options)
+
+
+class Result:
+    """The results of a run, read as they are asked for: the grid as it is in the file, or in the model's order."""
+
+    def __init__(self, file: h5py.File, path: Path) -> None:
+        self._file, self._grid, self.path = file, file["VTKHDF"], path
+
+    def __enter__(self) -> Result:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    @property
+    def complete(self) -> bool:
+        """Whether the run came to its end."""
+        return ".partial" not in self.path.suffixes
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """What the run was started with."""
+        return _read_json(self._file["mpitled"], "metadata")
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """What the run ended with; empty if it was killed."""
+        return _read_json(self._file["mpitled"], "figures") if "figures" in self._file["mpitled"] else {}
+
+    @property
+    def n_frames(self) -> int:
+        steps = self._grid["Steps"]
+        return min(int(steps.attrs["NSteps"]), len(steps["Values"]))
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """(n_frames,), s."""
+        return self._grid["Steps/Values"][: self.n_frames]
+
+    @property
+    def series(self) -> dict[str, NDArray[np.float64]]:
+        """Numbers of each frame, (n_frames,), by name."""
+        return {name: values[: self.n_frames] for name, values in self._grid.get("FieldData", {}).items()}
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """(nodes + integration points, 3), m, undeformed."""
+        return self._grid["Points"][...]
+
+    @property
+    def hexahedra(self) -> NDArray[np.int64]:
+        """(n_hexahedra, 8), rows of `points`."""
+        n_hexahedra = int(np.count_nonzero(self.cell_data("kind") == _HEXAHEDRON))
+        return self._grid["Connectivity"][: 8 * n_hexahedra].reshape(-1, 8)
+
+    def point_data(self, name: str, frame: int = 0) -> NDArray[Any]:
+        """Values at `points` in a frame (negative: from the last); of what does not change in any."""
+        return self._rows("Point", name, frame)
+
+    def cell_data(self, name: str, frame: int = 0) -> NDArray[Any]:
+        """Values in cells: hexahedra, EFG nodes (nan or -1 where it is nothing of theirs), integration points."""
+        return self._rows("Cell", name, frame)
+
+    def at_nodes(self, name: str, frame: int = 0) -> NDArray[Any]:
+        """Point data of the nodes, in the order of the model."""
+        return self.point_data(name, frame)[_ascending(self.point_data("node_id"))]
+
+    def at_integration_points(self, name: str, frame: int = 0) -> NDArray[Any]:
+        """Point data of the integration points, in the order of the model."""
+        cell_id = self.cell_data("cell_id")[self.cell_data("kind") == _INTEGRATION_POINT]
+        return self.point_data(name, frame)[self.point_data("node_id") < 0][np.argsort(cell_id)]
+
+    def in_cells(self, name: str, frame: int = 0) -> NDArray[Any]:
+        """Cell data of hexahedra and support domains, in the order of the model."""
+        return self.cell_data(name, frame)[_ascending(self.cell_data("cell_id"))]
+
+    def _rows(self, kind: str, name: str, frame: int) -> NDArray[Any]:
+        first = int(self._grid[f"Steps/{kind}DataOffsets/{name}"][: max(1, self.n_frames)][frame])
+        return self._grid[f"{kind}Data/{name}"][first : first + int(self._grid[f"NumberOf{kind}s"][0])]
+
+
+def _ascending(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rows of the numbers from 0 on, in their order; -1 is no number."""
+    rows = np.flatnonzero(numbers >= 0)
+    return rows[np.argsort(numbers[rows])]
+
+
+def open_result(path: Path) -> Result:
+    """Results in a file, or in a directory: there the finished ones, else the unfinished.
+
+    InputError if there are none, or the file is not one of ours or cut short.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = next((path / name for name in (_FINISHED, _UNFINISHED) if (path / name).exists()), path / _FINISHED)
+    file = _open(path)
+    layout = file["mpitled"].attrs.get("layout") if "mpitled" in file and "VTKHDF" in file else None
+    if layout == RESULT_LAYOUT:
+        return Result(file, path)
+    file.close()
+    if layout is None:
+        raise InputError(f"{path}: is not a result of mpitled; give a file that 'mpitled run' wrote")
+    raise InputError(f"{path}: has layout {layout}, this version reads {RESULT_LAYOUT}; run the deck again")
