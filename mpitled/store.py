@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
+from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -57,6 +58,8 @@ _MODEL_ARRAYS = {
 
 def write_model(path: Path, model: Model, key: str) -> None:
     """Write the model to `path` at once or not at all; `key` says what it was built from (see `model_key`).
+
+    InputError if it cannot be written.
 
     Arrays are contiguous, so that any range of rows is one read.
     """
@@ -130,13 +133,23 @@ def _replacing(path: Path) -> Iterator[Path]:
     """A temporary path beside `path` that takes its name, safe on disc, when the block ends well."""
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    with _told(path):
+        try:
+            yield temporary
+            _fsync(temporary)
+            os.replace(temporary, path)
+            _fsync(path.parent)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """What the disc refuses, as one line that names the file."""
     try:
-        yield temporary
-        _fsync(temporary)
-        os.replace(temporary, path)
-        _fsync(path.parent)
-    finally:
-        temporary.unlink(missing_ok=True)
+        yield
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({str(error).splitlines()[0]})") from None
 
 
 def _fsync(path: Path) -> None:
@@ -156,12 +169,14 @@ def _write_sets(group: h5py.Group, sets: dict[str, NDArray[np.int64]]) -> None:
 
 
 def _read_sets(group: h5py.Group) -> dict[str, NDArray[np.int64]]:
-    offsets = group["offsets"][...]
-    return dict(zip(_read_json(group, "names"), np.split(group["members"][...], offsets[1:-1]), strict=True))
+    members = group["members"][...]
+    slices = [members[start:stop] for start, stop in pairwise(group["offsets"][...])]
+    return dict(zip(_read_json(group, "names"), slices, strict=True))
 
 
 def _write_json(group: h5py.Group, name: str, value: Any) -> None:
-    text = json.dumps(value, ensure_ascii=True).encode()
+    # numpy's numbers become Python's.
+    text = json.dumps(value, default=lambda number: number.item()).encode()
     group.create_dataset(name, data=np.bytes_(text))
 
 
@@ -388,20 +403,22 @@ class ResultWriter:
         cell_data: Mapping[str, int] = MappingProxyType({"J": 1}),
         series: Sequence[str] = (),
     ) -> None:
-        """Write the mesh and make room for `n_frames` frames.
+        """Write the mesh and make room for `n_frames` frames at most.
 
         `comm` is an MPI communicator whose ranks are the parts in order, or None. `metadata` is what JSON can hold;
         rank 0's is kept. `point_data` and `cell_data` give the components of what each frame holds; `series` names
-        the numbers of each frame. InputError if the file cannot be made.
+        the numbers of each frame. InputError, from here on, if the file cannot be written.
         """
         if comm is not None and comm.size == 1:
             comm = None
+        if comm is not None and not h5py.get_config().mpi:
+            raise InputError("h5py: is built without MPI; build it against parallel HDF5, or run on one rank")
         self._comm, self._part, self._n_frames, self._frame = comm, part, n_frames, 0
         self._announced = {*point_data, *cell_data, *series}
         self._path = Path(directory) / _FINISHED
         self._partial = Path(directory) / _UNFINISHED
         self._transfer = None
-        try:
+        with _told(self._partial):
             if self._leads:
                 Path(directory).mkdir(parents=True, exist_ok=True)
             if comm is None:
@@ -411,14 +428,12 @@ class ResultWriter:
                 self._transfer = h5py.h5p.create(h5py.h5p.DATASET_XFER)
                 self._transfer.set_dxpl_mpio(h5py.h5fd.MPIO_COLLECTIVE)
                 self._file = h5py.File(self._partial, "w", driver="mpio", comm=comm)
-        except OSError as error:
-            raise InputError(f"{self._partial}: cannot be written ({str(error).splitlines()[0]})") from None
-        self._write_mesh()
-        self._make_steps(point_data, cell_data, series)
-        ours = self._file.create_group("mpitled")
-        ours.attrs["layout"] = RESULT_LAYOUT
-        self._note("metadata", metadata)
-        self._file.flush()
+            self._write_mesh()
+            self._make_steps(point_data, cell_data, series)
+            ours = self._file.create_group("mpitled")
+            ours.attrs["layout"] = RESULT_LAYOUT
+            self._note("metadata", metadata)
+            self._file.flush()
 
     @property
     def _leads(self) -> bool:
@@ -441,39 +456,40 @@ class ResultWriter:
         if {*point_data, *cell_data, *(series or {})} != self._announced:
             raise ValueError(f"every frame holds {', '.join(sorted(self._announced))}")
         grid, steps = self._file["VTKHDF"], self._file["VTKHDF/Steps"]
-        for name, values in point_data.items():
-            self._write(grid["PointData"][name], self._point_slabs, values, self._frame * self._n_points)
-        for name, values in cell_data.items():
-            self._write(
-                grid["CellData"][name], self._cell_slabs, self._with_efg(values, np.nan), self._frame * self._n_cells
-            )
-        if self._leads:
-            for name, value in (series or {}).items():
-                grid["FieldData"][name][self._frame] = value
-        self._file.flush()
-        self._frame += 1
-        steps.attrs.modify("NSteps", np.int64(self._frame))
-        self._file.flush()
-        # VTK reads all times into room for NSteps: there must never be more of them.
-        steps["Values"].resize((self._frame,))
-        if self._leads:
-            steps["Values"][self._frame - 1] = time
-        self._file.flush()
+        point_row, cell_row = self._frame * self._n_points, self._frame * self._n_cells
+        with _told(self._partial):
+            for name, values in point_data.items():
+                self._write(grid["PointData"][name], self._point_slabs, values, point_row)
+            for name, values in cell_data.items():
+                self._write(grid["CellData"][name], self._cell_slabs, self._with_efg(values, np.nan), cell_row)
+            if self._leads:
+                for name, value in (series or {}).items():
+                    grid["FieldData"][name][self._frame] = value
+            self._file.flush()
+            self._frame += 1
+            # Together, and before the next flush: VTK reads all times into room for NSteps of them.
+            steps.attrs.modify("NSteps", np.int64(self._frame))
+            steps["Values"].resize((self._frame,))
+            if self._leads:
+                steps["Values"][self._frame - 1] = time
+            self._file.flush()
 
     def close(self, figures: Mapping[str, Any] | None = None) -> None:
         """End the file with rank 0's figures of the run (what JSON can hold) and give it its name."""
         self.abandon(figures)
         if self._leads:
-            _fsync(self._partial)
-            os.replace(self._partial, self._path)
-            _fsync(self._path.parent)
+            with _told(self._partial):
+                _fsync(self._partial)
+                os.replace(self._partial, self._path)
+                _fsync(self._path.parent)
         if self._comm is not None:
             self._comm.barrier()
 
     def abandon(self, figures: Mapping[str, Any] | None = None) -> None:
         """End the file as it is; it keeps the name of an unfinished one and can be read."""
-        self._note("figures", figures or {})
-        self._file.close()
+        with _told(self._partial):
+            self._note("figures", figures or {})
+            self._file.close()
 
     def _note(self, name: str, value: Mapping[str, Any]) -> None:
         # Made alike on all ranks, as HDF5 demands of whatever makes a dataset.
@@ -698,13 +714,13 @@ def _ascending(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def open_result(path: Path) -> Result:
-    """Results in a file, or in a directory: there the finished ones, else the unfinished.
+    """Results in a file, or in a directory: there the unfinished ones, which are later than any finished, if any.
 
     InputError if there are none, or the file is not one of ours or cut short.
     """
     path = Path(path)
     if path.is_dir():
-        path = next((path / name for name in (_FINISHED, _UNFINISHED) if (path / name).exists()), path / _FINISHED)
+        path = next((path / name for name in (_UNFINISHED, _FINISHED) if (path / name).exists()), path / _FINISHED)
     file = _open(path)
     layout = file["mpitled"].attrs.get("layout") if "mpitled" in file and "VTKHDF" in file else None
     if layout == RESULT_LAYOUT:

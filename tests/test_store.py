@@ -2,35 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import fields, replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from parallel_store import N_FRAMES, frame, write
 
+import partition
 from mpitled import store
 from mpitled.errors import InputError
 from mpitled.material import Material
 from mpitled.mesh import grid_points, structured_hexahedra
 from mpitled.model import Model
-
-
-@dataclass(frozen=True)
-class Tables:
-    """The columns of partition.PartTables, made here the slow and obvious way."""
-
-    n_parts: int
-    cells: NDArray[np.int64]
-    cell_offsets: NDArray[np.int64]
-    nodes: NDArray[np.int64]
-    node_offsets: NDArray[np.int64]
-    owned_offsets: NDArray[np.int64]
-    neighbours: NDArray[np.int32]
-    neighbour_offsets: NDArray[np.int64]
-    shared: NDArray[np.int64]
-    shared_offsets: NDArray[np.int64]
 
 
 def small_model(seed: int = 0) -> Model:
@@ -69,22 +59,16 @@ def small_model(seed: int = 0) -> Model:
     )
 
 
-def part_tables(model: Model, parts: NDArray[np.int64], n_parts: int) -> Tables:
-    cell_nodes = [*model.hexahedra, *model.domains]
-    cells = [np.flatnonzero(parts == part) for part in range(n_parts)]
-    nodes = [np.unique(np.concatenate([np.empty(0, np.int64), *(cell_nodes[c] for c in own)])) for own in cells]
-    owned = [np.setdiff1d(own, np.concatenate([[], *nodes[:part]])) for part, own in enumerate(nodes)]
-    neighbours: list[list[int]] = []
-    shared: list[NDArray[np.int64]] = []
-    for part in range(n_parts):
-        common = {q: np.intersect1d(nodes[part], nodes[q]) for q in range(n_parts) if q != part}
-        neighbours.append([q for q in common if len(common[q])])
-        shared += [common[q] for q in neighbours[-1]]
+def random_parts(model: Model, n_parts: int) -> NDArray[np.int32]:
+    """Parts of the cells at random. Part 1 has no support domain; of 4 parts the last has no cell at all."""
+    parts = np.random.default_rng(n_parts).integers(min(n_parts, 3), size=model.n_cells, dtype=np.int32)
+    of_domains = parts[len(model.hexahedra) :]
+    of_domains[of_domains == 1] = 0
+    return parts
 
-    def join(arrays: list, dtype: type = np.int64) -> tuple[NDArray, NDArray[np.int64]]:
-        return np.concatenate([np.empty(0), *arrays]).astype(dtype), np.cumsum([0, *map(len, arrays)])
 
-    return Tables(n_parts, *join(cells), *join(nodes), join(owned)[1], *join(neighbours, np.int32), *join(shared))
+def add_partition(path: Path, model: Model, parts: NDArray[np.int32], n_parts: int) -> None:
+    store.write_partition(path, partition.tables(model.hexahedra, model.domains, parts, n_parts))
 
 
 def same(a: object, b: object) -> bool:
@@ -104,6 +88,9 @@ def test_model_comes_back_as_it_was(tmp_path: Path) -> None:
     for column in fields(Model):
         assert same(getattr(model, column.name), getattr(back, column.name)), column.name
     assert same(store.read_sets(path)[0], model.node_sets)
+    store.write_model(path, replace(model, node_sets={}, figures={"count": np.int64(3)}), "k")
+    assert store.read_model(path).node_sets == {}
+    assert store.read_model(path).figures == {"count": 3}
     assert [p.name for p in tmp_path.iterdir()] == ["model.h5"]
 
 
@@ -135,27 +122,26 @@ def test_a_failed_write_leaves_the_old_model(tmp_path: Path, monkeypatch: pytest
         raise OSError("disc full")
 
     monkeypatch.setattr(store, "_fsync", fail)
-    with pytest.raises(OSError, match="disc full"):
+    with pytest.raises(InputError, match=r"cannot be written \(disc full"):
         store.write_model(path, model, "new")
-    with pytest.raises(OSError, match="disc full"):
-        store.write_partition(path, part_tables(model, np.arange(model.n_cells) % 2, 2))
+    with pytest.raises(InputError, match=r"cannot be written \(disc full"):
+        add_partition(path, model, random_parts(model, 2), 2)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["model.h5"]
+    with pytest.raises(InputError, match="cannot be written"):
+        store.write_model(tmp_path / "nowhere" / "model.h5", model, "k")
 
 
 @pytest.mark.parametrize("n_parts", [1, 2, 3, 4])
 def test_parts_are_the_rows_of_the_model(tmp_path: Path, n_parts: int) -> None:
-    """Part 1 of 3 or more has no support domain, the last part of 4 has no cell at all."""
     path, model = tmp_path / "model.h5", small_model()
     store.write_model(path, model, "k")
-    parts = np.random.default_rng(n_parts).integers(min(n_parts, 3), size=model.n_cells)
-    parts[len(model.hexahedra) :][parts[len(model.hexahedra) :] == 1] = 0
+    parts = random_parts(model, n_parts)
     if n_parts > 1:
         with pytest.raises(InputError, match="no partition"):
             store.read_part(path, n_parts, 0)
-        store.write_partition(path, part_tables(model, np.arange(model.n_cells) % 5, 5))
-        store.write_partition(path, part_tables(model, np.zeros(model.n_cells, int), n_parts))
-        store.write_partition(path, part_tables(model, parts, n_parts))
+        for other, n in ((random_parts(model, 5), 5), (np.zeros_like(parts), n_parts), (parts, n_parts)):
+            add_partition(path, model, other, n)
     assert store.has_partition(path, n_parts)
     assert not store.has_partition(path, 7)
     assert same(store.read_model(path).hexahedra, model.hexahedra)
@@ -212,3 +198,174 @@ def test_rows_are_read_by_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         file["data"] = data
         for rows in (np.flatnonzero(data[:, 0] > 0.9), np.r_[0, 2:900, 4999], np.arange(5000), np.arange(0)):
             assert same(store.read_rows(file["data"], rows), data[rows])
+
+
+# --- results -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def model_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path, model = tmp_path_factory.mktemp("store") / "model.h5", small_model()
+    store.write_model(path, model, "k")
+    for n in (2, 4):
+        add_partition(path, model, random_parts(model, n), n)
+    return path
+
+
+def run(model_path: Path, directory: Path, n_ranks: int, end: str) -> int:
+    """Write the frames of parallel_store.py; the exit status."""
+    if n_ranks == 1 and end != "kill":
+        write(model_path, directory, end, None)
+        return 0
+    if shutil.which("mpirun") is None or not h5py.get_config().mpi:
+        pytest.skip("no mpirun, or h5py without MPI")
+    command = ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(n_ranks), sys.executable]
+    root = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+    arguments = [Path(__file__).with_name("parallel_store.py"), model_path, directory, end]
+    done = subprocess.run(
+        [*command, *arguments], env={**os.environ, **root}, timeout=60, capture_output=True, text=True
+    )
+    if end != "kill":
+        assert done.returncode == 0, done.stderr
+    return done.returncode
+
+
+def vtk_frames(path: Path) -> tuple[tuple[float, ...], list[dict[str, NDArray]]]:
+    """Times and frames as VTK's own reader sees them; anything that it complains about fails the test."""
+    vtk = pytest.importorskip("vtk")
+    from vtk.util.numpy_support import vtk_to_numpy
+
+    reader = vtk.vtkHDFReader()
+    complaints: list[str] = []
+    for event in ("ErrorEvent", "WarningEvent"):
+        reader.AddObserver(event, lambda *_: complaints.append(path.name))
+    reader.SetFileName(str(path))
+    reader.UpdateInformation()
+    times = reader.GetOutputInformation(0).Get(vtk.vtkStreamingDemandDrivenPipeline.TIME_STEPS())
+    frames = []
+    for time in times:
+        reader.UpdateTimeStep(time)
+        grid = reader.GetOutputDataObject(0)
+        assert isinstance(grid, vtk.vtkUnstructuredGrid)
+        arrays = {"points": vtk_to_numpy(grid.GetPoints().GetData()), "bounds": np.array(grid.GetBounds())}
+        arrays["types"] = np.array([grid.GetCellType(i) for i in range(grid.GetNumberOfCells())], np.uint8)
+        arrays["connectivity"] = vtk_to_numpy(grid.GetCells().GetConnectivityArray())
+        arrays["offsets"] = vtk_to_numpy(grid.GetCells().GetOffsetsArray())
+        for data in (grid.GetPointData(), grid.GetCellData(), grid.GetFieldData()):
+            for i in range(data.GetNumberOfArrays()):
+                arrays[data.GetArrayName(i)] = vtk_to_numpy(data.GetArray(i)).copy()
+        frames.append({name: array.copy() for name, array in arrays.items()})
+    assert not complaints
+    return times, frames
+
+
+@pytest.mark.parametrize("n_ranks", [1, 2, 4])
+def test_vtk_reads_the_same_whatever_the_ranks(model_path: Path, tmp_path: Path, n_ranks: int) -> None:
+    """Of 4 ranks the second has no support domain and the last nothing at all."""
+    model = store.read_model(model_path)
+    run(model_path, tmp_path, n_ranks, "close")
+    assert [p.name for p in tmp_path.iterdir()] == ["result.vtkhdf"]
+    times, frames = vtk_frames(tmp_path / "result.vtkhdf")
+    assert times == (0.0, 0.25, 0.5, 0.75)
+
+    n_hexahedra, n_efg, n_domains = len(model.hexahedra), model.n_nodes - model.n_fe_nodes, len(model.domains)
+    whole = store.read_part(model_path, 1, 0)
+    all_points = np.concatenate([model.points, model.domain_points])
+    for k, seen in enumerate(frames):
+        for name in ("points", "connectivity", "offsets", "types", "node_id", "cell_id", "part"):
+            assert same(seen[name], frames[0][name]), name
+        node_id, cell_id, kind = seen["node_id"], seen["cell_id"], seen["kind"]
+        assert np.bincount(kind).tolist() == [n_hexahedra, n_efg, n_domains]
+        assert same(seen["types"], np.array([12, 1, 1], np.uint8)[kind])
+        assert same(seen["bounds"], np.ravel([all_points.min(axis=0), all_points.max(axis=0)], order="F"))
+
+        # By global number: points and what they carry, then cells by the global numbers of their corners.
+        nodes, cells = np.argsort(node_id)[n_domains:], np.argsort(cell_id)[n_efg:]
+        assert same(node_id[nodes], np.arange(model.n_nodes))
+        assert same(cell_id[cells], np.arange(model.n_cells))
+        assert same(seen["points"][nodes], model.points)
+        assert same(seen["node_label"][nodes], model.node_ids)
+        first = seen["offsets"][:-1]
+        corners = seen["connectivity"][first[cells[:n_hexahedra], None] + np.arange(8)]
+        assert same(node_id[corners], model.hexahedra)
+        efg_nodes = seen["connectivity"][first[kind == 1]]
+        assert same(np.sort(node_id[efg_nodes]), np.arange(model.n_fe_nodes, model.n_nodes))
+        integration_points = seen["connectivity"][first[cells[n_hexahedra:]]]
+        assert (node_id[integration_points] == -1).all()
+        assert same(seen["points"][integration_points], model.domain_points)
+        assert same(seen["material"][cells], model.material)
+        parts = np.zeros(model.n_cells, np.int32) if n_ranks == 1 else random_parts(model, n_ranks)
+        assert same(seen["part"][cells], parts)
+
+        point_data, cell_data, series = frame(whole, k)
+        for name, expected in point_data.items():
+            assert same(seen[name][np.concatenate([nodes, integration_points])], expected), name
+        assert same(seen["J"][cells], cell_data["J"])
+        assert np.isnan(seen["J"][kind == 1]).all()
+        assert {name: seen[name].tolist() for name in series} == {name: [value] for name, value in series.items()}
+
+
+def test_results_come_back_in_the_order_of_the_model(model_path: Path, tmp_path: Path) -> None:
+    model, whole = store.read_model(model_path), store.read_part(model_path, 1, 0)
+    run(model_path, tmp_path, 2, "close")
+    with store.open_result(tmp_path) as result:
+        assert result.complete
+        assert result.metadata["ranks"] == 2
+        assert result.metadata["rank"] == 0
+        assert result.metadata["deck"].startswith("title = 'é'")
+        assert result.figures == {"rank": 0, "steps": 7}
+        assert result.times.tolist() == [0.0, 0.25, 0.5, 0.75]
+        assert result.series["energy"].tolist() == [0.0, 0.5, 1.0, 1.5]
+        assert same(result.at_nodes("node_label"), model.node_ids)
+        hexahedra = result.point_data("node_id")[result.hexahedra]
+        assert same(hexahedra[np.argsort(result.cell_data("cell_id")[: len(hexahedra)])], model.hexahedra)
+        for k in (*range(N_FRAMES), -1):
+            point_data, cell_data, _ = frame(whole, k % N_FRAMES)
+            for name, expected in point_data.items():
+                assert same(result.at_nodes(name, k), expected[: model.n_nodes])
+                assert same(result.at_integration_points(name, k), expected[model.n_nodes :])
+            assert same(result.in_cells("J", k), cell_data["J"])
+
+
+@pytest.mark.parametrize(("n_ranks", "end"), [(1, "abandon"), (1, "kill"), (2, "kill")])
+def test_an_unfinished_file_holds_the_finished_frames(model_path: Path, tmp_path: Path, n_ranks: int, end: str) -> None:
+    (tmp_path / "result.vtkhdf").write_text("of an earlier run")
+    assert (run(model_path, tmp_path, n_ranks, end) != 0) == (end == "kill")
+    times, frames = vtk_frames(tmp_path / "result.partial.vtkhdf")
+    assert times == (0.0, 0.25)
+    with store.open_result(tmp_path) as result:
+        assert not result.complete
+        assert result.n_frames == 2
+        assert result.figures == ({} if end == "kill" else {"rank": 0, "steps": 7})
+        for k, seen in enumerate(frames):
+            assert same(result.point_data("displacement", k), seen["displacement"])
+            assert same(result.at_nodes("displacement", k)[:, 0], np.arange(120.0) + k)
+
+
+def test_what_is_not_a_result_is_refused_in_one_line(model_path: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"result\.vtkhdf: there is no such file"):
+        store.open_result(tmp_path)
+    with pytest.raises(InputError, match="not a result of mpitled"):
+        store.open_result(model_path)
+    run(model_path, tmp_path, 1, "close")
+    whole = (tmp_path / "result.vtkhdf").read_bytes()
+    (tmp_path / "result.vtkhdf").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="cannot be read as HDF5") as refusal:
+        store.open_result(tmp_path)
+    assert "\n" not in str(refusal.value)
+    with pytest.raises(InputError, match="cannot be written"):
+        run(model_path, model_path / "below a file", 1, "close")
+
+
+def test_a_frame_holds_what_was_announced(model_path: Path, tmp_path: Path) -> None:
+    part = store.read_part(model_path, 1, 0)
+    writer = store.ResultWriter(tmp_path, None, part, 1, {})
+    point_data, cell_data, _ = frame(part, 0)
+    with pytest.raises(ValueError, match="every frame holds"):
+        writer.write_frame(0.0, {"displacement": point_data["displacement"]}, cell_data)
+    with pytest.raises(ValueError, match="values for rows"):
+        writer.write_frame(0.0, point_data, {"J": cell_data["J"][1:]})
+    writer.write_frame(0.0, point_data, cell_data)
+    with pytest.raises(ValueError, match="one more is written"):
+        writer.write_frame(1.0, point_data, cell_data)
+    writer.close()
