@@ -12,12 +12,15 @@ from scipy.spatial import cKDTree
 #: Faces of a hexahedron in the Abaqus/VTK node order.
 FACES = np.array([[0, 1, 2, 3], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
 
-#: Cells with so many nodes in common are neighbours, as two hexahedra at a face are. Joining all cells with any
-#: node in common would make a clique of every node's cells: hundreds of edges a cell in a dense cloud.
+#: Nodes that a support domain shares with its neighbours: as many as a face has with a hexahedron; with another support
+#: domain these, or half of its nodes if that is more. Cells with any node in common are hundreds in a dense cloud.
 SHARED = 4
 
 #: Nearest support domains that a support domain is joined to: as many as a hexahedron has faces.
 NEAREST = 6
+
+#: Weight of an edge across a face inside a block of hexahedra; the unit of the others.
+FACE_WEIGHT = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +32,8 @@ class CellGraph:
 
     xadj: NDArray[np.int64]  # (n_cells + 1,)
     adjncy: NDArray[np.int64]  # (2 n_edges,)
-    shared: NDArray[np.int64] | None  # (2 n_edges,), weight: nodes that both cells touch, at least 1; None: all alike
+    edge_weights: NDArray[np.int64] | None  # (2 n_edges,), at least 1; None: all alike
     n_hexahedra: int
-    connected: bool  # in one piece
 
     @property
     def n_cells(self) -> int:
@@ -43,9 +45,13 @@ def cell_graph(
 ) -> CellGraph:
     """The graph of hexahedra (n, 8), support domains (m, k) by their nodes, and their integration points (m, 3).
 
-    Hexahedra are joined by faces; a support domain to the `NEAREST` domains around it and to all cells that share at
-    least `SHARED` nodes with it. Where that leaves pieces of the mesh that still have nodes in common, single edges
-    join them, so the graph is in one piece where the mesh is. Time and memory grow linearly with the cells.
+    Hexahedra are joined by faces; a support domain to the `NEAREST` domains around it and to all cells that share
+    enough nodes with it (see `SHARED`). Where that leaves pieces of the mesh that still have nodes in common, single
+    edges join them, so the graph is in one piece where the mesh is. Time and memory grow linearly with the cells.
+
+    An edge weighs the sum of 1 / (d - 1) over the shared nodes, each of d cells (the clique model of a net in Lengauer,
+    Combinatorial Algorithms for Integrated Circuit Layout, 1990), so that METIS, which sees edges, makes few halo
+    nodes. A dense cloud has many more edges a node than hexahedra have; if all weighed the same, cuts would avoid it.
     """
     hexahedra = np.ascontiguousarray(hexahedra, dtype=np.int64).reshape(-1, 8)
     domains = np.ascontiguousarray(domains, dtype=np.int64)
@@ -54,26 +60,44 @@ def cell_graph(
     mates = _face_mates(hexahedra, n_nodes)
     pairs = np.empty((0, 2), dtype=np.int64)
     if len(domains):
-        start, touching = _cells_of_nodes(hexahedra, domains, n_nodes)
-        near = _nearest_pairs(domain_points) + n_hexahedra
-        n_sharing = _sharing_pairs(domains, n_hexahedra, start, touching, pairs)
-        sharing = np.empty((n_sharing, 2), dtype=np.int64)
-        _sharing_pairs(domains, n_hexahedra, start, touching, sharing)
-        pairs = _unique_pairs(np.concatenate([near, sharing]), n_cells)
+        pairs = _domain_pairs(hexahedra, domains, domain_points, n_nodes)
     tree = _forest(mates, pairs, n_cells)
     n_pieces = int(np.count_nonzero(tree == np.arange(n_cells)))
     if n_pieces > 1:
-        bridges = np.empty((n_pieces - 1, 2), dtype=np.int64)
         start, touching = _cells_of_nodes(hexahedra, domains, n_nodes)
+        bridges = np.empty((n_pieces - 1, 2), dtype=np.int64)
         n_bridges = _bridges(tree, start, touching, bridges)
         pairs = np.concatenate([pairs, bridges[:n_bridges]])
-        n_pieces -= n_bridges
     if len(pairs):
-        xadj, adjncy, shared = _compressed_rows(mates, pairs, _shared_nodes(hexahedra, domains, pairs), n_cells)
-    else:
-        xadj = np.concatenate([[0], np.cumsum(np.count_nonzero(mates >= 0, axis=1))])
-        adjncy, shared = mates[mates >= 0], None
-    return CellGraph(xadj, adjncy, shared, n_hexahedra, connected=n_pieces <= 1)
+        n_touching = np.bincount(hexahedra.ravel(), minlength=n_nodes) + np.bincount(domains.ravel(), minlength=n_nodes)
+        weights = _weights(hexahedra, domains, pairs, n_touching)
+        xadj, adjncy, edge_weights = _compressed_rows(mates, pairs, weights, n_cells)
+        return CellGraph(xadj, adjncy, edge_weights, n_hexahedra)
+    xadj = np.concatenate([[0], np.cumsum(np.count_nonzero(mates >= 0, axis=1))])
+    return CellGraph(xadj, mates[mates >= 0], None, n_hexahedra)
+
+
+def _domain_pairs(
+    hexahedra: NDArray[np.int64], domains: NDArray[np.int64], domain_points: NDArray[np.float64], n_nodes: int
+) -> NDArray[np.int64]:
+    """The edges of support domains, (n, 2) cells, the lower first, in order, each once."""
+    n_hexahedra, n_cells = len(hexahedra), len(hexahedra) + len(domains)
+    start, touching = _cells_of_nodes(hexahedra, domains, n_nodes)
+    near = _nearest(domain_points)
+    own = np.repeat(np.arange(len(near)), near.shape[1])
+    near = near.ravel()
+    low, high = np.minimum(own, near) + n_hexahedra, np.maximum(own, near) + n_hexahedra
+    sharing = np.empty(0, dtype=np.int64)
+    sharing = np.empty(_sharing(domains, n_hexahedra, start, touching, sharing), dtype=np.int64)
+    _sharing(domains, n_hexahedra, start, touching, sharing)
+    keys = np.unique(np.concatenate([(low * n_cells + high)[low != high], sharing]))
+    return np.stack(np.divmod(keys, n_cells), axis=1)
+
+
+def _nearest(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """The `NEAREST` points around each point and, mostly first, itself."""
+    k = min(NEAREST + 1, len(points))
+    return cKDTree(points, balanced_tree=False).query(points, k=np.arange(1, k + 1))[1]
 
 
 @njit(cache=True)
@@ -137,39 +161,29 @@ def _cells_of_nodes(hexahedra, domains, n_nodes):  # type: ignore[no-untyped-def
     return start, cells
 
 
-def _nearest_pairs(points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Pairs (n, 2) of a point and each of the `NEAREST` points around it."""
-    k = min(NEAREST + 1, len(points))
-    found = cKDTree(points, balanced_tree=False).query(points, k=np.arange(1, k + 1))[1]
-    pairs = np.stack([np.repeat(np.arange(len(points)), k), found.ravel()], axis=1)
-    return pairs[pairs[:, 0] != pairs[:, 1]]
-
-
 @njit(cache=True)
-def _sharing_pairs(domains, n_hexahedra, start, cells, pairs):  # type: ignore[no-untyped-def]
-    """Fills `pairs` with each domain and the lower cells that share `SHARED` nodes with it, or only counts them if empty."""
-    common = np.zeros(n_hexahedra + len(domains), np.int32)
+def _sharing(domains, n_hexahedra, start, cells, keys):  # type: ignore[no-untyped-def]
+    """The number of pairs of a support domain and a lower cell that share enough nodes.
+
+    Fills `keys` with them, as lower cell times number of cells plus domain, unless it is empty.
+    """
+    n_cells = n_hexahedra + len(domains)
+    common = np.zeros(n_cells, np.int32)
     n = 0
-    for d in range(len(domains)):
-        for node in domains[d]:
+    for d in range(n_hexahedra, n_cells):
+        for node in domains[d - n_hexahedra]:
             for c in cells[start[node] : start[node + 1]]:
-                if c >= n_hexahedra + d:
+                if c >= d:
                     break
                 common[c] += 1
-                if common[c] == SHARED:
-                    if len(pairs):
-                        pairs[n, 0], pairs[n, 1] = c, n_hexahedra + d
+                if common[c] == (SHARED if c < n_hexahedra else max(SHARED, domains.shape[1] // 2)):
+                    if len(keys):
+                        keys[n] = c * n_cells + d
                     n += 1
-        for node in domains[d]:
+        for node in domains[d - n_hexahedra]:
             for c in cells[start[node] : start[node + 1]]:
                 common[c] = 0
     return n
-
-
-def _unique_pairs(pairs: NDArray[np.int64], n_cells: int) -> NDArray[np.int64]:
-    """The pairs (n, 2) in order, lower cell first, each once."""
-    keys = np.unique(pairs.min(axis=1) * n_cells + pairs.max(axis=1))
-    return np.stack(np.divmod(keys, n_cells), axis=1)
 
 
 @njit(cache=True)
@@ -209,24 +223,27 @@ def _bridges(tree, start, cells, bridges):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _shared_nodes(hexahedra, domains, pairs):  # type: ignore[no-untyped-def]
-    """The number of nodes that both cells of each pair touch, at least 1."""
-    shared = np.zeros(len(pairs), np.int64)
+def _weights(hexahedra, domains, pairs, n_touching):  # type: ignore[no-untyped-def]
+    """The weight of each pair: nodes that both cells touch, those of few cells weigh more; at least 1."""
+    # A node inside a block has 8 hexahedra, and a face 4 nodes.
+    unit = FACE_WEIGHT / (4 / 7)
+    weights = np.empty(len(pairs), np.int64)
     n = len(hexahedra)
     for i in range(len(pairs)):
         a, b = pairs[i]
+        weight = 0.0
         for node in hexahedra[a] if a < n else domains[a - n]:
             for other in hexahedra[b] if b < n else domains[b - n]:
                 if node == other:
-                    shared[i] += 1
+                    weight += unit / (n_touching[node] - 1)
                     break
-        shared[i] = max(shared[i], 1)
-    return shared
+        weights[i] = max(1, round(weight))
+    return weights
 
 
 @njit(cache=True)
-def _compressed_rows(mates, pairs, shared, n_cells):  # type: ignore[no-untyped-def]
-    """The rows (xadj, adjncy, weights) of hexahedra at faces, which share 4 nodes, and of the other pairs."""
+def _compressed_rows(mates, pairs, pair_weights, n_cells):  # type: ignore[no-untyped-def]
+    """The rows (xadj, adjncy, weights) of hexahedra joined by faces and of the other pairs."""
     xadj = np.zeros(n_cells + 1, np.int64)
     for c in range(len(mates)):
         for mate in mates[c]:
@@ -241,12 +258,12 @@ def _compressed_rows(mates, pairs, shared, n_cells):  # type: ignore[no-untyped-
     for c in range(len(mates)):
         for mate in mates[c]:
             if mate >= 0:
-                adjncy[free[c]], weights[free[c]] = mate, 4
+                adjncy[free[c]], weights[free[c]] = mate, FACE_WEIGHT
                 free[c] += 1
     for i in range(len(pairs)):
         a, b = pairs[i]
-        adjncy[free[a]], weights[free[a]] = b, shared[i]
-        adjncy[free[b]], weights[free[b]] = a, shared[i]
+        adjncy[free[a]], weights[free[a]] = b, pair_weights[i]
+        adjncy[free[b]], weights[free[b]] = a, pair_weights[i]
         free[a] += 1
         free[b] += 1
     return xadj, adjncy, weights
