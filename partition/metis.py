@@ -34,7 +34,7 @@ def cut(graph: CellGraph, n_parts: int, weights: tuple[float, float], seed: int 
     integer = pymetis.zero_copy_dtype()
     units = np.rint(np.array(weights) / min(weights) * COST_UNITS).astype(integer)
     cost = np.repeat(units, [graph.n_hexahedra, graph.n_cells - graph.n_hexahedra])
-    if cost.sum(dtype=np.float64) + 2 * graph.adjncy.size > np.iinfo(integer).max:
+    if max(cost.sum(dtype=np.float64), graph.adjncy.size) > np.iinfo(integer).max:
         raise ValueError(f"{graph.n_cells} cells are too many for this METIS, which counts in {integer}")
     part = pymetis.part_graph(
         n_parts,

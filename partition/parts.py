@@ -55,7 +55,7 @@ def tables(
     border_parts = np.repeat(np.arange(n_parts), counts)[at_border]
     order = np.argsort(border_nodes, kind="stable")
     border_nodes, border_parts = border_nodes[order], border_parts[order]
-    first = np.concatenate([[True], border_nodes[1:] != border_nodes[:-1]])[: len(border_nodes)]
+    first = _firsts(border_nodes)
     owned = np.bincount(border_parts[first], minlength=n_parts) + counts
     owned -= np.bincount(border_parts, minlength=n_parts)
 
@@ -67,7 +67,8 @@ def tables(
     me, other = me[me != other], other[me != other]
     link = border_parts[me] * n_parts + border_parts[other]
     order = np.argsort(link, kind="stable")
-    links, n_shared = np.unique(link, return_counts=True)
+    link_starts = np.flatnonzero(_firsts(link[order]))
+    links = link[order][link_starts]
     return PartTables(
         n_parts=n_parts,
         cells=cells,
@@ -78,11 +79,17 @@ def tables(
         neighbours=(links % n_parts).astype(np.int32),
         neighbour_offsets=_offsets(np.bincount(links // n_parts, minlength=n_parts)),
         shared=border_nodes[me[order]],
-        shared_offsets=_offsets(n_shared),
+        shared_offsets=np.append(link_starts, len(link)),
     )
 
 
+def _firsts(ascending: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Where a value differs from the one before it."""
+    return np.concatenate([[True], ascending[1:] != ascending[:-1]])[: len(ascending)]
+
+
 def _offsets(counts: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Where each of so many items begins, and the last ends: (len(counts) + 1,)."""
     return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
 
 

@@ -1,0 +1,218 @@
+"""The graph of cells, its cut and the tables of parts, against closed forms and brute force."""
+
+import resource
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from mpitled.mesh import grid_points, structured_hexahedra
+from partition import CellGraph, PartTables, cell_graph, cut, figures, tables
+
+NO_DOMAINS = np.empty((0, 8), dtype=np.int64)
+NO_POINTS = np.empty((0, 3))
+COSTS = (1.0, 1.3)
+
+
+def mixed(
+    n: int, core: float = 0.5, nodes: int = 8, share: float = 1.0
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Hexahedra, support domains, their points: n^3 cells whose core is a random cloud with 8 `share` points a cell."""
+    rng = np.random.default_rng(1)
+    hexahedra, points = structured_hexahedra((n, n, n)), grid_points((n, n, n), (1.0, 1.0, 1.0))
+    centres = points[hexahedra].mean(axis=1)
+    in_core = np.abs(centres - 0.5).max(axis=1) < core / 2
+    efg = np.setdiff1d(np.arange(len(points)), hexahedra[~in_core])
+    points[efg] += rng.uniform(-0.3 / n, 0.3 / n, (len(efg), 3))
+    eighths = np.stack(np.meshgrid(*[[-0.25, 0.25]] * 3), axis=-1).reshape(-1, 3) / n
+    domain_points = (centres[in_core][:, None] + eighths).reshape(-1, 3)
+    domain_points = domain_points[rng.random(len(domain_points)) < share]
+    domain_points += rng.uniform(-0.1 / n, 0.1 / n, domain_points.shape)
+    return hexahedra[~in_core], cKDTree(points).query(domain_points, k=nodes)[1], domain_points
+
+
+def edges(graph: CellGraph) -> set[tuple[int, int]]:
+    """Every entry of the rows, as a pair; fails if one is there twice."""
+    rows = np.repeat(np.arange(graph.n_cells), np.diff(graph.xadj))
+    pairs = list(zip(rows.tolist(), graph.adjncy.tolist(), strict=True))
+    assert len(set(pairs)) == len(pairs)
+    return set(pairs)
+
+
+def pieces(graph: CellGraph) -> int:
+    matrix = csr_matrix((np.ones(len(graph.adjncy)), graph.adjncy, graph.xadj), shape=(graph.n_cells, graph.n_cells))
+    return int(connected_components(matrix, directed=False)[0])
+
+
+def test_hexahedra_are_joined_by_faces_whatever_their_numbers():
+    """Inner faces of an nx x ny x nz block: (nx - 1) ny nz and so on."""
+    nx, ny, nz = 5, 4, 3
+    block = structured_hexahedra((nx, ny, nz))
+    graph = cell_graph(block, NO_DOMAINS, NO_POINTS)
+    found = edges(graph)
+    assert len(found) == 2 * ((nx - 1) * ny * nz + nx * (ny - 1) * nz + nx * ny * (nz - 1))
+    i, j, k = np.unravel_index(np.arange(nx * ny * nz), (nx, ny, nz), order="F")
+    for a, b in found:
+        assert abs(i[a] - i[b]) + abs(j[a] - j[b]) + abs(k[a] - k[b]) == 1
+
+    rng = np.random.default_rng(0)
+    cells, nodes = rng.permutation(len(block)), rng.permutation(block.max() + 1)
+    # Rotations of the corners about the local z axis, so that faces meet in every orientation.
+    turned = np.stack([h[(np.arange(8) // 4) * 4 + (np.arange(8) + r) % 4] for h, r in zip(block, cells, strict=True)])
+    shuffled = edges(cell_graph(nodes[turned][cells], NO_DOMAINS, NO_POINTS))
+    assert {(cells[a], cells[b]) for a, b in shuffled} == found
+
+
+@pytest.mark.parametrize("nodes", [8, 20])
+def test_support_domains_are_joined_to_the_nearest_and_to_those_that_share_nodes(nodes):
+    hexahedra, domains, points = mixed(6, nodes=nodes, share=0.4)
+    graph = cell_graph(hexahedra, domains, points)
+    found = edges(graph)
+    n = len(hexahedra)
+    assert all((b, a) in found and a != b for a, b in found)
+    assert pieces(graph) == 1
+    assert graph.edge_weights.min() >= 1
+
+    nearest = cKDTree(points).query(points, k=7)[1]
+    expected = {(n + a, n + b) for a, row in enumerate(nearest) for b in row if a != b}
+    touched = [set(cell) for cell in [*hexahedra.tolist(), *domains.tolist()]]
+    for a in range(n, len(touched)):
+        needed = [4] * n + [max(4, nodes // 2)] * (a - n)
+        expected |= {(a, b) for b in range(a) if len(touched[a] & touched[b]) >= needed[b]}
+    hexahedra_only = edges(cell_graph(hexahedra, NO_DOMAINS, NO_POINTS))
+    assert found == expected | {(b, a) for a, b in expected} | hexahedra_only
+
+
+def test_graph_is_in_one_piece_where_the_mesh_is():
+    """Two hexahedra at one edge have no face in common, and a third touches neither."""
+    shared_edge = np.array([[0, 1, 2, 3, 4, 5, 6, 7], [2, 8, 9, 10, 6, 11, 12, 13], np.arange(20, 28)])
+    graph = cell_graph(shared_edge, NO_DOMAINS, NO_POINTS)
+    assert edges(graph) == {(0, 1), (1, 0)}
+
+
+@pytest.mark.parametrize(
+    ("scene", "n_parts"),
+    [("hexahedra", 2), ("hexahedra", 7), ("cloud", 4), ("mixed", 2), ("mixed", 5), ("mixed", 16)],
+)
+def test_parts_have_equal_cost_and_their_tables_agree(scene, n_parts):
+    hexahedra, domains, points = mixed(10, core={"hexahedra": 0.0, "cloud": 1.1, "mixed": 0.5}[scene], share=0.4)
+    graph = cell_graph(hexahedra, domains, points)
+    part = cut(graph, n_parts, COSTS, seed=3)
+    assert np.array_equal(part, cut(graph, n_parts, COSTS, seed=3))
+    assert part.dtype == np.int32
+    assert set(part) == set(range(n_parts))
+
+    found = tables(hexahedra, domains, part, n_parts)
+    quality = figures(found, COSTS, len(hexahedra), graph)
+    # METIS leaves a bisection within 0.1 % or two mean cells; halved again and again, these add up to four cells.
+    mean = quality.cost.mean()
+    assert quality.cost.max() <= mean * 1.001 ** np.ceil(np.log2(n_parts)) + 4 * max(COSTS)
+    check_tables(found, hexahedra, domains, part, n_parts)
+
+    rows = np.repeat(np.arange(graph.n_cells), np.diff(graph.xadj))
+    assert quality.cut.sum() == np.count_nonzero(part[rows] != part[graph.adjncy])
+    assert quality.cost.sum() == pytest.approx(len(hexahedra) * COSTS[0] + len(domains) * COSTS[1], rel=1e-12)
+    text = quality.describe()
+    assert len(text.splitlines()) == n_parts + 4
+    assert f"{n_parts} parts: balance {quality.balance:.4f}" in text
+
+
+def check_tables(
+    found: PartTables, hexahedra: NDArray[np.int64], domains: NDArray[np.int64], part: NDArray[np.int32], n_parts: int
+) -> None:
+    """The tables against sets of nodes, part by part."""
+    cells = [*hexahedra.tolist(), *domains.tolist()]
+    mine = [sorted({node for c in np.flatnonzero(part == p) for node in cells[c]}) for p in range(n_parts)]
+    owner = {node: p for p in reversed(range(n_parts)) for node in mine[p]}
+    for p in range(n_parts):
+        own = slice(*found.cell_offsets[p : p + 2])
+        assert found.cells[own].tolist() == np.flatnonzero(part == p).tolist()
+        own = slice(*found.node_offsets[p : p + 2])
+        assert found.nodes[own].tolist() == mine[p]
+        assert np.diff(found.owned_offsets)[p] == sum(of == p for of in owner.values())
+        expected = {q: sorted(set(mine[p]) & set(mine[q])) for q in range(n_parts) if q != p}
+        expected = {q: nodes for q, nodes in expected.items() if nodes}
+        links = range(*found.neighbour_offsets[p : p + 2])
+        assert found.neighbours[links.start : links.stop].tolist() == list(expected)
+        for link, nodes in zip(links, expected.values(), strict=True):
+            assert found.shared[slice(*found.shared_offsets[link : link + 2])].tolist() == nodes
+    assert found.owned_offsets[-1] == len(owner)
+    assert len(found.shared_offsets) == len(found.neighbours) + 1
+    assert found.shared_offsets[-1] == len(found.shared)
+
+
+def test_parts_without_one_kind_of_cell():
+    """Both occur where the core is several parts wide."""
+    hexahedra, domains, points = mixed(10, core=0.7)
+    part = cut(cell_graph(hexahedra, domains, points), 32, COSTS)
+    found = tables(hexahedra, domains, part, 32)
+    quality = figures(found, COSTS, len(hexahedra))
+    assert (quality.domains == 0).any()
+    assert (quality.hexahedra == 0).any()
+    assert quality.cut is None
+    check_tables(found, hexahedra, domains, part, 32)
+
+
+def test_one_part_needs_no_metis(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pymetis", None)
+    hexahedra, domains, points = mixed(4)
+    graph = cell_graph(hexahedra, domains, points)
+    part = cut(graph, 1, COSTS)
+    assert part.dtype == np.int32
+    assert part.tolist() == [0] * graph.n_cells
+    found = tables(hexahedra, domains, part, 1)
+    check_tables(found, hexahedra, domains, part, 1)
+    with pytest.raises(ImportError):
+        cut(graph, 2, COSTS)
+
+
+def test_as_many_parts_as_cells_but_no_more():
+    """METIS leaves a part of 27 single cells empty; none is in the end."""
+    block = structured_hexahedra((3, 3, 3))
+    graph = cell_graph(block, NO_DOMAINS, NO_POINTS)
+    assert sorted(cut(graph, 27, COSTS)) == list(range(27))
+    with pytest.raises(ValueError, match="cannot cut 27 cells into 28 parts"):
+        cut(graph, 28, COSTS)
+    with pytest.raises(ValueError, match="cannot cut into 0 parts"):
+        cut(graph, 0, COSTS)
+    with pytest.raises(ValueError, match="costs must be positive"):
+        cut(graph, 2, (1.0, 0.0))
+
+
+def test_edge_weights_leave_fewer_halo_nodes():
+    """A dense cloud has many more edges a node than hexahedra: weighed alike, METIS cuts around it, not through."""
+    hexahedra, domains, points = mixed(16)
+    graph = cell_graph(hexahedra, domains, points)
+    halo = {}
+    for name, weighed in {"nets": graph, "alike": replace(graph, edge_weights=None)}.items():
+        parts = [cut(weighed, 2, COSTS, seed) for seed in range(3)]
+        halo[name] = sum(len(tables(hexahedra, domains, part, 2).shared) for part in parts)
+    assert halo["nets"] < halo["alike"]
+
+
+@pytest.mark.study
+def test_four_million_hexahedra():
+    """Seconds and peak memory of graph, cut and tables; run with -s to see them, alone in a process."""
+    tables_of_few = structured_hexahedra((4, 4, 4))
+    tables(tables_of_few, NO_DOMAINS, cut(cell_graph(tables_of_few, NO_DOMAINS, NO_POINTS), 2, COSTS), 2)
+    block = structured_hexahedra((160, 160, 157))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    start = time.perf_counter()
+    graph = cell_graph(block, NO_DOMAINS, NO_POINTS)
+    print(f"\ngraph {time.perf_counter() - start:.1f} s")
+    part = cut(graph, 2, COSTS)
+    print(f"cut {time.perf_counter() - start:.1f} s")
+    found = tables(block, NO_DOMAINS, part, 2)
+    seconds = time.perf_counter() - start
+    peak = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024 / len(block)
+    print(f"tables {seconds:.1f} s, peak {peak:.0f} bytes a cell")
+    print(figures(found, COSTS, len(block), graph).describe())
+    # Under 3 minutes and 1 KB a cell together with building the model: half of both is ours at most.
+    assert seconds < 90
+    assert peak < 500
