@@ -1,0 +1,341 @@
+"""Label images: true volumes, one manifold solid, sets, the void of a tumour, any orientation, clear errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from mpitled import deck
+from mpitled.cloud import FACES, boundary_faces
+from mpitled.errors import InputError
+from mpitled.labels import mesh_labels, solid_cells
+
+nibabel = pytest.importorskip("nibabel")
+
+DATA = Path(__file__).parent.parent / "jobs" / "data"
+CENTRE = (-0.026, -0.070, 0.003)
+
+
+def tumour(centre=CENTRE):
+    return deck.Tumour(centre=centre, volume=523.6e-9)
+
+
+@pytest.fixture(scope="module")
+def brain():
+    """The shipped brain in 5 mm hexahedra, without a tumour and with one."""
+    labels = deck.Labels(image=DATA / "mni152_labels_1mm.nii.gz", element_size=0.005)
+    cloud = deck.Cloud(points_per_spacing=1.4)
+    return mesh_labels(labels, cloud, None), mesh_labels(labels, cloud, tumour())
+
+
+def n_pieces(hexahedra):
+    """Number of face-connected pieces; asserts that no face has more than two hexahedra."""
+    _, face, count = np.unique(
+        np.sort(hexahedra[:, FACES].reshape(-1, 4), axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    assert count.max() <= 2
+    cell = np.arange(face.size) // 6
+    graph = coo_array((np.ones(face.size), (cell, len(hexahedra) + face.ravel())), (len(hexahedra) + len(count),) * 2)
+    return connected_components(graph, directed=False)[0]
+
+
+def assert_manifold(faces):
+    """Each edge of the surface is met by two of its faces, and the faces around each node are one fan."""
+    edges = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
+    _, edge, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    assert set(count) == {2}
+    # Corners of faces are joined across edges: the fans of all nodes. As many fans as nodes: one each.
+    face = np.arange(len(edges)) // 4
+    first, second = np.sort(np.argsort(edge.ravel(), kind="stable").reshape(-1, 2), axis=1).T
+    corner = {}
+    for node_of in (0, 1):
+        corner[node_of] = 4 * face + np.where(node_of == 0, np.arange(len(edges)) % 4, (np.arange(len(edges)) + 1) % 4)
+    # Neighbours run along their common edge in opposite directions: start meets end.
+    joins = [(corner[0][first], corner[1][second]), (corner[1][first], corner[0][second])]
+    i, j = (np.concatenate(side) for side in zip(*joins, strict=True))
+    assert (faces.ravel()[i] == faces.ravel()[j]).all()
+    fans = connected_components(coo_array((np.ones(len(i)), (i, j)), (faces.size,) * 2), directed=False)[0]
+    assert fans == len(np.unique(faces))
+
+
+def test_brain_is_one_manifold_solid_of_true_volumes(brain):
+    mesh, _ = brain
+    assert n_pieces(mesh.hexahedra) == 1
+    surface = boundary_faces(mesh.hexahedra)
+    assert_manifold(surface)
+    np.testing.assert_array_equal(mesh.node_sets["skull"], np.unique(surface))
+    np.testing.assert_array_equal(np.unique(mesh.hexahedra), np.arange(mesh.n_nodes))
+    figures, cube = mesh.figures, 0.005**3
+    # Whole cubes: each label can be half a cube off, the repaired solid one or two.
+    assert figures["image_solid_volume_m3"] == pytest.approx(1837.79e-6, rel=1e-9)
+    assert abs(figures["solid_volume_m3"] - figures["image_solid_volume_m3"]) < 2 * cube
+    for side in ("left", "right"):
+        name = f"{side}_ventricle"
+        assert figures[f"image_{name}_volume_m3"] == pytest.approx(8.558e-6, rel=1e-9)
+        assert abs(figures[f"{name}_volume_m3"] - 8.558e-6) <= 0.5 * cube
+        cells = mesh.hexahedra[mesh.cell_sets[name]]
+        assert len(cells) * cube == pytest.approx(figures[f"{name}_volume_m3"])
+        assert n_pieces(cells) == 1
+        np.testing.assert_array_equal(mesh.node_sets[name], np.unique(cells))
+        assert not np.isin(mesh.node_sets["skull"], cells).any()
+        assert (mesh.points[cells].mean(axis=(0, 1))[0] < 0) == (side == "left")
+    assert_partition(mesh)
+
+
+def assert_partition(mesh):
+    parts = [mesh.cell_sets[name] for name in ("tissue", "left_ventricle", "right_ventricle")]
+    np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.arange(mesh.n_cells))
+    np.testing.assert_array_equal(mesh.cell_sets["all"], np.arange(mesh.n_cells))
+
+
+def test_nodes_and_hexahedra_are_numbered_along_x(brain):
+    for mesh in brain:
+        fe = np.rint((mesh.points[: mesh.n_fe_nodes] - mesh.points.min(axis=0)) / 0.005).astype(int)
+        assert (np.diff(fe @ [1, 1000, 1000000]) > 0).all()
+        assert (np.diff(fe[mesh.hexahedra[:, 0]] @ [1, 1000, 1000000]) > 0).all()
+        # Neighbours along x: where one cell ends the next one starts, and all eight node numbers go up by one.
+        a, b = mesh.hexahedra[:-1], mesh.hexahedra[1:]
+        neighbours = a[:, 1] == b[:, 0]
+        assert neighbours.mean() > 0.9
+        assert (b[neighbours] == a[neighbours] + 1).mean() > 0.9
+        np.testing.assert_array_equal(mesh.hexahedra[:, 1], mesh.hexahedra[:, 0] + 1)
+
+
+def test_tumour_makes_a_void_in_tissue_only(brain):
+    whole, mesh = brain
+    np.testing.assert_array_equal(mesh.points[mesh.node_sets["skull"]], whole.points[whole.node_sets["skull"]])
+    for name in ("left_ventricle", "right_ventricle"):
+        np.testing.assert_array_equal(mesh.points[mesh.node_sets[name]], whole.points[whole.node_sets[name]])
+    assert n_pieces(mesh.hexahedra) == 1
+    np.testing.assert_array_equal(np.unique(mesh.hexahedra), np.arange(mesh.n_fe_nodes))
+    assert_partition(mesh)
+    dropped = len(whole.hexahedra) - len(mesh.hexahedra)
+    assert mesh.figures["void_volume_m3"] == pytest.approx(dropped * 0.005**3, rel=1e-12)
+    seed_volume = 4 / 3 * np.pi * 0.002**3
+    void = mesh.figures["void_volume_m3"] - seed_volume
+    assert mesh.integration_volumes.sum() == pytest.approx(void, rel=1e-12)
+    seed = mesh.points[mesh.node_sets["tumour"]]
+    assert len(seed) == 400
+    np.testing.assert_allclose(np.linalg.norm(seed - CENTRE, axis=1), 0.002, rtol=1e-12)
+    cavity = np.setdiff1d(np.unique(boundary_faces(mesh.hexahedra)), mesh.node_sets["skull"])
+    np.testing.assert_array_equal(mesh.node_sets["interface"], cavity)
+    # The sphere of 18 mm, to a ragged layer of half a hexahedron.
+    middle = whole.points[whole.hexahedra].mean(axis=1)
+    inside = np.linalg.norm(middle - CENTRE, axis=1) <= 0.018
+    assert dropped == np.count_nonzero(inside & np.isin(np.arange(len(middle)), whole.cell_sets["tissue"]))
+
+
+@pytest.mark.parametrize("element_size", [0.002, 0.003, 0.004])
+def test_the_tumour_of_the_decks_fits_at_every_element_size(element_size):
+    labels = deck.Labels(image=DATA / "mni152_labels_2mm.nii.gz", element_size=element_size)
+    mesh = mesh_labels(labels, deck.Cloud(points_per_spacing=1.4), tumour())
+    assert mesh.figures["void_volume_m3"] == pytest.approx(4 / 3 * np.pi * 0.018**3, rel=0.05)
+    assert 2.4 < mesh.figures["integration_points_per_efg_node"] < 4
+    assert n_pieces(mesh.hexahedra) == 1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_solids_are_repaired(seed):
+    """Noise has hundreds of edges and vertices where the solid meets itself, cavities and loose pieces."""
+    share = np.zeros((16, 15, 14))
+    share[2:-2, 2:-2, 2:-2] = np.random.default_rng(seed).random((12, 11, 10))
+    solid, added = solid_cells(share)
+    assert added > 0
+    index = np.arange(17 * 16 * 15).reshape(17, 16, 15)
+    corners = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
+    hexahedra = np.stack([index[k : k + 16, j : j + 15, i : i + 14][solid] for i, j, k in corners], axis=1)
+    assert n_pieces(hexahedra) == 1
+    surface = boundary_faces(hexahedra)
+    assert_manifold(surface)
+    inside = connected_components(
+        coo_array((np.ones(4 * len(surface)), (np.repeat(surface[:, 0], 4), surface.ravel())), (index.size,) * 2),
+        directed=False,
+    )[1]
+    assert len(np.unique(inside[np.unique(surface)])) == 1  # one surface: no cavity
+
+
+# --- phantoms --------------------------------------------------------------------------------------------------------
+
+
+def phantom(voxel=(1.0, 1.0, 1.0), gap=0.5, left=(6.0, 12.0, 5.0), right=(4.0, 9.0, 4.0)):
+    """Labels and affine of an ellipsoid, semi-axes 34, 42, 30 mm around (3, -5, 7) mm, with two ventricles."""
+    box = zip((3, -5, 7), (36, 44, 32), voxel, strict=True)
+    axes = [np.arange(c - half + v / 2, c + half, v) for c, half, v in box]
+    x, y, z = np.meshgrid(*axes, indexing="ij")
+    data = np.zeros(x.shape, np.int16)
+
+    def ball(centre, semi):
+        return sum(((p - c) / s) ** 2 for p, c, s in zip((x, y, z), centre, semi, strict=True)) <= 1
+
+    data[ball((3, -5, 7), (34, 42, 30))] = 41
+    data[ball((3 - gap - left[0], -5, 7), left)] = 5
+    data[ball((3 + gap + right[0], -5, 7), right)] = 7
+    affine = np.diag([*voxel, 1.0])
+    affine[:3, 3] = [a[0] for a in axes]
+    return data, affine
+
+
+def save(path, data, affine):
+    nibabel.save(nibabel.Nifti1Image(data, affine), path)
+    return path
+
+
+def labels_of(path, size=0.004, **keys):
+    given = {"tissue": (41,), "left_ventricle": (5,), "right_ventricle": (7,)} | keys
+    return deck.Labels(image=path, element_size=size, **given)
+
+
+@pytest.mark.parametrize("voxel", [(1.0, 1.0, 1.0), (1.0, 1.5, 2.0)])
+@pytest.mark.parametrize("size", [0.003, 0.0047])
+def test_volumes_and_places_of_anisotropic_voxels(tmp_path, voxel, size):
+    data, affine = phantom(voxel)
+    mesh = mesh_labels(labels_of(save(tmp_path / "p.nii.gz", data, affine), size), deck.Cloud(), None)
+    ml = 1e-9 * np.prod(voxel)
+    for name, label in (("left_ventricle", 5), ("right_ventricle", 7)):
+        assert abs(mesh.figures[f"{name}_volume_m3"] - (data == label).sum() * ml) <= 0.5 * size**3
+    assert abs(mesh.figures["solid_volume_m3"] - (data > 0).sum() * ml) <= 2 * size**3
+    middle = mesh.points[mesh.hexahedra].mean(axis=1)
+    # Places are those of the ellipsoids, to a quarter of a hexahedron.
+    np.testing.assert_allclose(middle.mean(axis=0), [0.003, -0.005, 0.007], atol=size / 4)
+    left = middle[mesh.cell_sets["left_ventricle"]].mean(axis=0)
+    np.testing.assert_allclose(left, [-0.0035, -0.005, 0.007], atol=size / 4)
+    assert len(mesh.node_sets["skull"]) == len(np.unique(boundary_faces(mesh.hexahedra)))
+
+
+@pytest.mark.parametrize("axes", ["LPS", "PSR", "IAL"])
+def test_orientation_of_the_file_does_not_matter(tmp_path, axes):
+    data, affine = phantom((1.0, 1.5, 2.0))
+    image = nibabel.Nifti1Image(data, affine)
+    turned = nibabel.orientations.ornt_transform(
+        nibabel.orientations.axcodes2ornt("RAS"), nibabel.orientations.axcodes2ornt(axes)
+    )
+    nibabel.save(image.as_reoriented(turned), tmp_path / "turned.nii")
+    mesh = mesh_labels(labels_of(tmp_path / "turned.nii"), deck.Cloud(), None)
+    same = mesh_labels(labels_of(save(tmp_path / "p.nii", data, affine)), deck.Cloud(), None)
+    np.testing.assert_allclose(mesh.points, same.points, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(mesh.hexahedra, same.hexahedra)
+    for name in mesh.cell_sets:
+        np.testing.assert_array_equal(mesh.cell_sets[name], same.cell_sets[name])
+
+
+def test_ventricles_that_share_faces_stay_two(tmp_path):
+    data, affine = phantom(gap=0.0, left=(9.0, 14.0, 9.0), right=(5.0, 10.0, 7.0))
+    assert (data[:-1][data[1:] == 7] == 5).any()
+    mesh = mesh_labels(labels_of(save(tmp_path / "p.nii", data, affine)), deck.Cloud(), None)
+    for name, label in (("left_ventricle", 5), ("right_ventricle", 7)):
+        cells = mesh.hexahedra[mesh.cell_sets[name]]
+        assert n_pieces(cells) == 1
+        assert abs(len(cells) * 64e-9 - (data == label).sum() * 1e-9) <= 0.5 * 64e-9
+    assert len(np.intersect1d(mesh.node_sets["left_ventricle"], mesh.node_sets["right_ventricle"])) >= 4
+
+
+def test_loose_pieces_cavities_and_a_ventricle_at_the_surface(tmp_path):
+    data, affine = phantom()
+    data[:3, :3, :3] = 41
+    data[34:38, 60:64, 40:44] = 0
+    data[30:34, 40:46, 60:] = np.where(data[30:34, 40:46, 60:] > 0, 5, 0)
+    mesh = mesh_labels(labels_of(save(tmp_path / "p.nii", data, affine)), deck.Cloud(), None)
+    assert "0.027 ml" in mesh.remarks[0]
+    assert "left out" in mesh.remarks[0]
+    assert "0.064 ml" in mesh.remarks[1]
+    assert "taken as tissue" in mesh.remarks[1]
+    assert not np.isin(mesh.node_sets["left_ventricle"], mesh.node_sets["skull"]).any()
+
+
+def test_a_ventricle_within_the_void_is_tied_to_the_rest(tmp_path):
+    """A void of 19 mm holds the whole small right ventricle, which would be an island."""
+    data, affine = phantom(right=(4.0, 5.0, 4.0), gap=4.0)
+    path = save(tmp_path / "p.nii", data, affine)
+    seed = tumour((0.0115, 0.006, 0.007))
+    mesh = mesh_labels(labels_of(path, 0.0025), deck.Cloud(radius=0.019), seed)
+    assert n_pieces(mesh.hexahedra) == 1
+    whole = mesh_labels(labels_of(path, 0.0025), deck.Cloud(), None)
+    assert len(mesh.cell_sets["right_ventricle"]) == len(whole.cell_sets["right_ventricle"])
+    middle = whole.points[whole.hexahedra[whole.cell_sets["right_ventricle"]]].mean(axis=1)
+    assert np.linalg.norm(middle - seed.centre, axis=1).max() < 0.019
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda data, affine: (data, affine @ tilt(5.0)), "oblique"),
+        (lambda data, affine: (np.stack([data, data], axis=3), affine), "not three dimensions"),
+        (lambda data, affine: (data * np.float32(0.5), affine), "no integers"),
+        (lambda data, affine: (np.where(data == 5, 41, data).astype(np.int16), affine), r"label 5 .*left_ventricle"),
+        (lambda data, affine: (np.zeros_like(data), affine), r"label 41 .*tissue"),
+        (lambda data, affine: (data.astype(np.complex64), affine), "complex64"),
+    ],
+)
+def test_bad_images_get_one_line_that_names_file_and_remedy(tmp_path, change, message):
+    path = save(tmp_path / "bad.nii.gz", *change(*phantom()))
+    with pytest.raises(InputError, match=message) as error:
+        mesh_labels(labels_of(path), deck.Cloud(), None)
+    assert str(error.value).startswith(str(path))
+    assert "\n" not in str(error.value)
+
+
+def tilt(degrees):
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+
+def test_files_that_are_no_image(tmp_path):
+    whole = (DATA / "mni152_labels_2mm.nii.gz").read_bytes()
+    for name, content, message in (
+        ("missing.nii.gz", None, "no such file"),
+        ("text.nii.gz", b"not an image", "not an image"),
+        ("text.txt", b"not an image", "not an image"),
+        ("short.nii.gz", whole[: len(whole) // 2], "not an image"),
+    ):
+        path = tmp_path / name
+        if content is not None:
+            path.write_bytes(content)
+        with pytest.raises(InputError, match=message) as error:
+            mesh_labels(labels_of(path), deck.Cloud(), None)
+        assert str(error.value).startswith(str(path))
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("centre", "message"),
+    [
+        ((0.5, 0.0, 0.0), "outside the brain"),
+        ((0.003, 0.0362, 0.007), "room|outside"),
+        ((-0.0035, -0.005, 0.007), "in the left ventricle"),
+        ((0.003, -0.043, 0.007), "so near to the skull|around it need"),
+    ],
+)
+def test_a_tumour_that_does_not_lie_in_tissue_is_refused(tmp_path, centre, message):
+    path = save(tmp_path / "p.nii", *phantom())
+    with pytest.raises(InputError, match=message) as error:
+        mesh_labels(labels_of(path), deck.Cloud(), tumour(centre))
+    assert str(error.value).startswith("tumour.centre = (")
+    assert "move it" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"size": 0.004e-3}, "enlarge it"),
+        ({"size": 0.2}, "make it smaller"),
+        ({"size": 0.03}, "make it smaller"),
+        ({"tissue": ()}, "labels.tissue names no label"),
+        ({"right_ventricle": (41,)}, "given twice"),
+    ],
+)
+def test_labels_section_that_cannot_be_met(tmp_path, keys, message):
+    path = save(tmp_path / "p.nii", *phantom())
+    with pytest.raises(InputError, match=message):
+        mesh_labels(labels_of(path, **keys), deck.Cloud(), None)
+
+
+def test_a_brain_without_ventricles(tmp_path):
+    path = save(tmp_path / "p.nii", *phantom())
+    labels = labels_of(path, tissue=(5, 7, 41), left_ventricle=(), right_ventricle=())
+    mesh = mesh_labels(labels, deck.Cloud(), None)
+    assert set(mesh.cell_sets) == {"all", "tissue"}
+    assert set(mesh.node_sets) == {"skull"}
