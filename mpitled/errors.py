@@ -5,6 +5,7 @@ class MpitledError(Exception):
     """An end with a reason: one line to the user, no traceback."""
 
     status = 1
+    everywhere = False  # whether every rank raises it alike, so that one message is enough and none need be aborted
 
 
 class InputError(MpitledError):
