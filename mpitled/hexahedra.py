@@ -16,9 +16,9 @@ from mpitled.mesh import CORNERS
 
 _r, _s, _t = CORNERS.T.astype(float)
 #: The modes that a gradient has: r, s, t, rs, st, rt, one per row.
-GRADIENT_MODES = np.stack([_r, _s, _t, _r * _s, _s * _t, _r * _t])
+GRADIENT_MODES: NDArray[np.float64] = np.stack([_r, _s, _t, _r * _s, _s * _t, _r * _t])
 #: The hourglass modes rs, st, rt, rst, one per row: H^T of the paper's eq. 4.19.
-HOURGLASS_MODES = np.stack([_r * _s, _s * _t, _r * _t, _r * _s * _t])
+HOURGLASS_MODES: NDArray[np.float64] = np.stack([_r * _s, _s * _t, _r * _t, _r * _s * _t])
 #: A hexahedron with less than this share of its longest edge cubed is flat: an aspect of 1000 in two directions.
 FLAT = 1e-6
 
@@ -74,7 +74,7 @@ def hourglass_vectors(
 ) -> NDArray[np.float64]:
     """gamma = H - B (x^T H), (n, 8, 4): the modes less their affine part (paper, eq. 4.20)."""
     x_hourglass = np.matmul(HOURGLASS_MODES, points[hexahedra])
-    return np.asarray(HOURGLASS_MODES.T - np.matmul(gradients, x_hourglass.transpose(0, 2, 1)))
+    return np.subtract(HOURGLASS_MODES.T, np.matmul(gradients, x_hourglass.transpose(0, 2, 1)), dtype=np.float64)
 
 
 def hourglass_stiffness(
@@ -97,7 +97,7 @@ def nodal_mass(cells: NDArray[np.integer], cell_mass: NDArray[np.float64], n_nod
     4.18 for support domains.
     """
     share = np.repeat(cell_mass / cells.shape[1], cells.shape[1])
-    return np.bincount(cells.ravel(), share, n_nodes)
+    return np.bincount(cells.ravel(), share, n_nodes).astype(np.float64, copy=False)
 
 
 def corner_jacobians(points: NDArray[np.float64], hexahedra: NDArray[np.integer]) -> NDArray[np.float64]:

@@ -1,0 +1,216 @@
+"""The paper's preprocessor (4.1): from a deck to the discrete model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpitled import block, hexahedra, labels, support
+from mpitled.deck import Deck
+from mpitled.errors import InputError
+from mpitled.loading import growth
+from mpitled.material import Material
+from mpitled.mesh import Mesh, named_set
+from mpitled.model import Model
+
+#: The node set of a seed's surface, which the meshers make where there is a tumour.
+TUMOUR = "tumour"
+#: Node sets of the outer surface: no constant stress is in balance there without the tractions.
+OUTER = ("skull", "surface")
+
+
+def read_mesh(deck: Deck) -> Mesh:
+    """The mesh of a deck's one geometry section."""
+    if deck.labels:
+        return labels.mesh_labels(deck.labels, deck.cloud, deck.tumour)
+    if deck.block:
+        return block.block_mesh(deck.block, deck.cloud, deck.tumour)
+    assert deck.mesh is not None  # load_deck sees to one of the three
+    from mpitled import reader
+
+    return reader.read_mesh(deck.mesh)
+
+
+def build(deck: Deck) -> Model:
+    """The model of a deck. InputError if the mesh and the deck do not fit each other."""
+    mesh, options = read_mesh(deck), deck.support
+    material, materials = _materials(deck, mesh)
+    at, volumes, n_hexahedra = mesh.integration_points, mesh.integration_volumes, len(mesh.hexahedra)
+    limits, wanted = _limits(deck, mesh)
+    found = support.find_domains(mesh.points, at, options.nodes, limits, wanted, options.min_domains)
+    mesh, domains = _without(found.orphans, mesh, found.domains)
+    n_fe_nodes, points = mesh.n_fe_nodes, mesh.points
+    limits, _ = _limits(deck, mesh)
+    repaired = support.repair(points, at, domains, options.basis, options.weight, limits)
+    shapes, gradients, condition = support.moving_least_squares(points[domains], at, options.basis, options.weight)
+    field_domains, field_shapes = support.field_at_nodes(points, n_fe_nodes, at, domains, options.basis, options.weight)
+    dofs, displacements = prescribe(deck, mesh)
+
+    fe_gradients, fe_volumes = hexahedra.geometry(points, mesh.hexahedra, deck.hexahedra.gradient)
+    figures = dict(mesh.figures)
+    if options.consistency and len(domains):
+        free = np.zeros(len(points), bool)
+        free[domains] = True
+        for name in OUTER:
+            free[mesh.node_sets.get(name, [])] = False
+        free[dofs // 3] = False
+        balance = support.nodal_sum(mesh.hexahedra, fe_volumes[:, None, None] * fe_gradients, len(points))
+        gradients, corrected = support.correct_consistency(points[domains], domains, gradients, volumes, balance, free)
+        figures |= corrected
+
+    lam, mu, density = (np.array([getattr(m, name) for m in materials])[material] for name in ("lam", "mu", "density"))
+    cell_mass = density * np.concatenate([hexahedra.volumes(points, mesh.hexahedra), volumes])
+    mass = _shared(mesh.hexahedra, domains, cell_mass, len(points))
+    stiffness = (lam + 2 * mu) * np.concatenate(
+        [fe_volumes * (fe_gradients**2).sum((1, 2)), volumes * (gradients**2).sum((1, 2))]
+    )
+    stiffness[:n_hexahedra] *= 1 + deck.hexahedra.hourglass  # k gamma^T gamma = R (lambda + 2 mu) V (B:B) on a box
+    stiffness[n_hexahedra:] *= 1 + options.stabilisation / 8
+    each = np.concatenate([8 * stiffness[:n_hexahedra], options.nodes * stiffness[n_hexahedra:]])
+    critical = 2 * np.sqrt(mass / _shared(mesh.hexahedra, domains, each, len(points)))
+    loose = np.setdiff1d(np.arange(len(points)), dofs // 3)
+    figures |= {
+        "critical_step_min_s": float(critical[loose].min()) if len(loose) else float(critical.min()),
+        "critical_step_median_s": float(np.median(critical[loose])) if len(loose) else float(critical.min()),
+        "mass_kg": float(cell_mass.sum()),
+        "volume_m3": float(fe_volumes.sum() + volumes.sum()),
+        "domains_limited": found.limited,
+        "memberships_added": found.added,
+        "orphans_removed": len(found.orphans),
+        "domains_repaired": repaired,
+        "worst_condition": float(condition.max()) if len(condition) else 1.0,
+    }
+    return Model(
+        points=points,
+        n_fe_nodes=n_fe_nodes,
+        node_ids=mesh.node_ids,
+        hexahedra=mesh.hexahedra,
+        domains=domains,
+        domain_points=at,
+        domain_volumes=volumes,
+        domain_gradients=gradients,
+        domain_shapes=shapes,
+        field_domains=field_domains,
+        field_shapes=field_shapes,
+        material=material,
+        materials=materials,
+        mass=mass,
+        prescribed_dofs=dofs,
+        prescribed_displacements=displacements,
+        node_sets=mesh.node_sets,
+        cell_sets=mesh.cell_sets,
+        figures=figures,
+        remarks=mesh.remarks,
+    )
+
+
+def _limits(deck: Deck, mesh: Mesh) -> tuple[list[support.Limit], NDArray[np.bool_]]:
+    """What a support domain may not hold too much of, and the nodes that have to be in enough of them.
+
+    A domain of nodes on the seed's surface alone would see them move as one, and expand by (R / r0)^3 when they grow:
+    half of a domain's nodes may be there. FE nodes of the interface have to be in domains as EFG nodes have, or the
+    two parts are not coupled there (paper, 5.2).
+    """
+    fe = np.arange(mesh.n_nodes) < mesh.n_fe_nodes
+    seed = np.zeros(mesh.n_nodes, bool)
+    seed[mesh.node_sets.get(TUMOUR, [])] = True
+    wanted = ~fe
+    wanted[mesh.node_sets.get("interface", [])] = True
+    return [(fe, deck.support.max_fe_nodes), (seed, deck.support.nodes // 2)], wanted
+
+
+def _shared(
+    cells: NDArray[np.int64], domains: NDArray[np.int64], values: NDArray[np.float64], n_nodes: int
+) -> NDArray[np.float64]:
+    """(n_nodes,): each cell's value (n_cells,), shared equally by its nodes (mass: eq. 4.17 and 4.18)."""
+    n = len(cells)
+    return hexahedra.nodal_mass(cells, values[:n], n_nodes) + hexahedra.nodal_mass(domains, values[n:], n_nodes)
+
+
+def _materials(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int16], tuple[Material, ...]]:
+    """Material of each cell, and the materials: those that the deck names first, then those of the mesh's own file.
+
+    "all" fills what no other set claims.
+    """
+    claims = [(name, section.material) for section in deck.materials for name in section.cells]
+    claims += [(name, material) for name, material in mesh.materials.items() if not deck.materials]
+    materials = tuple(dict.fromkeys(material for _, material in claims))
+    chosen = np.full(mesh.n_cells, -1, np.int16)
+    for name, material in sorted(claims, key=lambda claim: claim[0] == "all"):
+        origin = f"{deck.path}: material.{material.name}.cells"
+        cells = np.arange(mesh.n_cells) if name == "all" else named_set(mesh.cell_sets, name, origin)
+        if name == "all":
+            cells = cells[chosen < 0]
+        elif (chosen[cells] >= 0).any():
+            twice = materials[chosen[cells].max()].name
+            raise InputError(
+                f"{origin}: {np.count_nonzero(chosen[cells] >= 0)} cells of '{name}' are of material '{twice}' "
+                "already; take them out of one of the two"
+            )
+        chosen[cells] = materials.index(material)
+    if (chosen < 0).any():
+        cell = int(np.argmax(chosen < 0))
+        sets = [name for name, members in mesh.cell_sets.items() if cell in members]
+        raise InputError(
+            f"{deck.path}: material: {np.count_nonzero(chosen < 0)} cells have none, the first in "
+            f"{' and '.join(sets) or 'no set'}; name their set in a material's cells"
+        )
+    return chosen, materials
+
+
+def _without(orphans: NDArray[np.int64], mesh: Mesh, domains: NDArray[np.int64]) -> tuple[Mesh, NDArray[np.int64]]:
+    """The mesh and the domains without nodes that no domain has: they would have no mass (4.1.7)."""
+    if len(orphans) == 0:
+        return mesh, domains
+    keep = np.ones(mesh.n_nodes, bool)
+    keep[orphans] = False
+    number = np.cumsum(keep) - 1
+    sets = {name: number[nodes[keep[nodes]]] for name, nodes in mesh.node_sets.items()}
+    remark = f"{len(orphans)} EFG nodes that are in no support domain removed"
+    kept = replace(
+        mesh,
+        points=mesh.points[keep],
+        node_ids=mesh.node_ids[keep],
+        node_sets=sets,
+        remarks=(*mesh.remarks, remark),
+    )
+    return kept, number[domains]
+
+
+def prescribe(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Prescribed dofs (3 node + direction, ascending) and their displacements (m) at full load.
+
+    InputError if a dof is asked to be in two places, or nothing at all is prescribed.
+    """
+    dofs, values, origins = [], [], []
+    for constraint in (*deck.constraints(), *mesh.constraints):
+        nodes = named_set(mesh.node_sets, constraint.node_set, constraint.origin)
+        for direction, displacement in zip(constraint.directions, constraint.displacement, strict=True):
+            dofs.append(3 * nodes + direction)
+            values.append(np.full(len(nodes), displacement))
+            origins.append(constraint.origin)
+    if deck.tumour:
+        origin = f"{deck.path}: tumour"
+        nodes = named_set(mesh.node_sets, TUMOUR, origin)
+        moved = growth(mesh.points[nodes], np.array(deck.tumour.centre), deck.tumour.seed_radius, deck.tumour.volume)
+        dofs.append((3 * nodes[:, None] + np.arange(3)).ravel())
+        values.append(moved.ravel())
+        origins.append(origin)
+    if not dofs:
+        raise InputError(f"{deck.path}: nothing is fixed, displaced or grows; add [[fixed]], [[displaced]] or [tumour]")
+    every, at, source = np.concatenate(dofs), np.concatenate(values), np.repeat(np.arange(len(dofs)), [*map(len, dofs)])
+    order = np.lexsort((at, every))
+    every, at, source = every[order], at[order], source[order]
+    clash = np.flatnonzero((np.diff(every) == 0) & (np.diff(at) != 0))
+    if len(clash):
+        first = clash[0]
+        node = every[first] // 3
+        raise InputError(
+            f"{origins[source[first + 1]]}: node {mesh.node_ids[node]} is moved by {at[first + 1] * 1e3:g} mm in "
+            f"{'xyz'[every[first] % 3]}, and by {at[first] * 1e3:g} mm through {origins[source[first]]}; "
+            f"take it out of one of the two ({len(clash)} such)"
+        )
+    keep = np.append(True, np.diff(every) > 0)
+    return every[keep], at[keep]
