@@ -1,0 +1,720 @@
+"""The compiled kernels of a step: nodal forces, the survey of the cells, the central-difference update, packing.
+
+Nodal arrays are component-major, (3, n_nodes + PADDING). Cells are worked on in lanes, so that the innermost loops
+vectorise; every index in them is unsigned, because numba's test for negative indices stops the vectoriser.
+Forces are *internal* forces f; the equation of motion is m a = -f at free nodes. All are in SI units, and run in the
+precision of the arrays that they are given. Constants are cast (`u.dtype.type`), or float32 would be promoted.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numba import uint64 as U
+
+VOXEL_LANES = 32  # cells of one run that are in flight at once
+BATCH_LANES = 16  # cells of one gathered batch
+PADDING = VOXEL_LANES  # a short run reads beyond its last node, and never writes there
+
+_ROUND = np.uint64(8)
+_VL = np.uint64(VOXEL_LANES)
+_BL = np.uint64(BATCH_LANES)
+# Fused multiply-adds and free association, but NaN and infinity stay what they are: the watch needs them.
+_FAST = {"contract", "nsz", "arcp", "reassoc"}
+_inline = njit(fastmath=_FAST, error_model="numpy", cache=True)
+_kernel = njit(fastmath=_FAST, error_model="numpy", cache=True, nogil=True)
+
+
+@_inline
+def _cofactor(a, b, c, d, e, f, g, h, i):  # type: ignore[no-untyped-def]
+    """Cofactor K = J X^-T of the 3x3 tensor with these rows, and its determinant J."""
+    k0 = e * i - f * h
+    k1 = f * g - d * i
+    k2 = d * h - e * g
+    k3 = c * h - b * i
+    k4 = a * i - c * g
+    k5 = b * g - a * h
+    k6 = b * f - c * e
+    k7 = c * d - a * f
+    k8 = a * e - b * d
+    return k0, k1, k2, k3, k4, k5, k6, k7, k8, a * k0 + b * k1 + c * k2
+
+
+@_inline
+def _first_piola(a, b, c, d, e, f, g, h, i, mu, lam, one):  # type: ignore[no-untyped-def]
+    """P = mu X + (lambda (J - 1) - mu / J) K (design of `material.first_piola`), and J, from grad u."""
+    a += one
+    e += one
+    i += one
+    k0, k1, k2, k3, k4, k5, k6, k7, k8, J = _cofactor(a, b, c, d, e, f, g, h, i)
+    q = lam * (J - one) - mu / J
+    return (
+        mu * a + q * k0, mu * b + q * k1, mu * c + q * k2,
+        mu * d + q * k3, mu * e + q * k4, mu * f + q * k5,
+        mu * g + q * k6, mu * h + q * k7, mu * i + q * k8,
+        J,
+    )  # fmt: skip
+
+
+@_inline
+def _energy_and_bound(a, b, c, d, e, f, g, h, i, mu, lam, g0, g1, g2, g3, g4, g5, one):  # type: ignore[no-untyped-def]
+    """J, the elastic energy but for its -mu ln J, and a bound of the tangent's largest eigenvalue, from grad u.
+
+    The bound is (lambda + mu / J^2) |B K^T|^2 + (mu + |q| sqrt(2) |X|) |B|^2, q = lambda (J - 1) - mu / J, Frobenius
+    norms, with B^T B = g (xx, xy, xz, yy, yz, zz): the material part's rank-one term, and the initial-stress term.
+    mu and lam carry the cell's volume.
+    """
+    energy = (a + e + i) * (one + one) + (a * a + b * b + c * c + d * d + e * e + f * f + g * g + h * h + i * i)
+    a += one
+    e += one
+    i += one
+    k0, k1, k2, k3, k4, k5, k6, k7, k8, J = _cofactor(a, b, c, d, e, f, g, h, i)
+    square = a * a + b * b + c * c + d * d + e * e + f * f + g * g + h * h + i * i
+    bk = (
+        g0 * (k0 * k0 + k3 * k3 + k6 * k6)
+        + g3 * (k1 * k1 + k4 * k4 + k7 * k7)
+        + g5 * (k2 * k2 + k5 * k5 + k8 * k8)
+        + (one + one)
+        * (g1 * (k0 * k1 + k3 * k4 + k6 * k7) + g2 * (k0 * k2 + k3 * k5 + k6 * k8) + g4 * (k1 * k2 + k4 * k5 + k7 * k8))
+    )
+    q = lam * (J - one) - mu / J
+    half = one / (one + one)
+    bound = (lam + mu / (J * J)) * bk + (mu + abs(q) * np.sqrt((one + one) * square)) * (g0 + g3 + g5)
+    return J, half * (mu * energy + lam * (J - one) * (J - one)), bound
+
+
+# ---------------------------------------------------------------- voxel hexahedra, in runs along a grid line
+
+
+@_inline
+def _voxel_modes(u, start, run, lanes, g0, g1, g2, grad, q):  # type: ignore[no-untyped-def]
+    """grad u (9, lanes) and the hourglass modes H^T u (12, lanes) of a run, by butterflies of additions.
+
+    On a box gamma^T u = H^T u, for x^T H = 0 (eq. 4.20).
+    """
+    a0 = start[0, run]
+    a1 = start[1, run]
+    a2 = start[2, run]
+    a3 = start[3, run]
+    a4 = start[4, run]
+    a5 = start[5, run]
+    a6 = start[6, run]
+    a7 = start[7, run]
+    for c in range(3):
+        uc = u[c]
+        for w in range(lanes):
+            u0 = uc[a0 + w]
+            u1 = uc[a1 + w]
+            u2 = uc[a2 + w]
+            u3 = uc[a3 + w]
+            u4 = uc[a4 + w]
+            u5 = uc[a5 + w]
+            u6 = uc[a6 + w]
+            u7 = uc[a7 + w]
+            p0 = u0 + u1
+            m0 = u1 - u0
+            p1 = u3 + u2
+            m1 = u2 - u3
+            p2 = u4 + u5
+            m2 = u5 - u4
+            p3 = u7 + u6
+            m3 = u6 - u7
+            dm = m1 - m0
+            dn = m3 - m2
+            dp = p1 - p0
+            dq = p3 - p2
+            grad[3 * c, w] = ((m0 + m1) + (m2 + m3)) * g0
+            grad[3 * c + 1, w] = (dp + dq) * g1
+            grad[3 * c + 2, w] = ((p2 + p3) - (p0 + p1)) * g2
+            q[c, w] = dm + dn
+            q[3 + c, w] = dq - dp
+            q[6 + c, w] = (m2 - m0) + (m3 - m1)
+            q[9 + c, w] = dn - dm
+
+
+@_kernel
+def voxel_forces(u, f, start, length, scale, coefficient):  # type: ignore[no-untyped-def]
+    """Add the nodal forces of runs of equal boxes to f; the smallest J among them.
+
+    start (8, n_runs) and length (n_runs,), uint64: a run's cell w has the nodes start + w. scale (3, n_runs), 1/m: the
+    gradient of a sign vector, 1 / (4 edge). coefficient (3, n_runs), J: mu V, lambda V, and in N/m the hourglass
+    stiffness k of eq. 4.22 (R (lambda + 2 mu) V (B:B) / 8).
+    """
+    one = u.dtype.type(1)
+    grad = np.empty((9, _VL), u.dtype)
+    q = np.empty((12, _VL), u.dtype)
+    jacobian = np.empty(_VL, u.dtype)
+    force = np.empty((8, _VL), u.dtype)
+    smallest = u.dtype.type(np.inf)
+    for run in range(U(start.shape[1])):
+        n = length[run]
+        lanes = (n + _ROUND - U(1)) // _ROUND * _ROUND
+        g0 = scale[0, run]
+        g1 = scale[1, run]
+        g2 = scale[2, run]
+        mu = coefficient[0, run]
+        lam = coefficient[1, run]
+        k = coefficient[2, run]
+        _voxel_modes(u, start, run, lanes, g0, g1, g2, grad, q)
+        for w in range(lanes):
+            p = _first_piola(
+                grad[0, w], grad[1, w], grad[2, w], grad[3, w], grad[4, w], grad[5, w], grad[6, w], grad[7, w],
+                grad[8, w], mu, lam, one,
+            )  # fmt: skip
+            grad[0, w] = p[0]
+            grad[1, w] = p[1]
+            grad[2, w] = p[2]
+            grad[3, w] = p[3]
+            grad[4, w] = p[4]
+            grad[5, w] = p[5]
+            grad[6, w] = p[6]
+            grad[7, w] = p[7]
+            grad[8, w] = p[8]
+            jacobian[w] = p[9]
+        for w in range(n):
+            smallest = min(smallest, jacobian[w])
+        for c in range(3):
+            fc = f[c]
+            for w in range(lanes):
+                q0 = k * q[c, w]
+                q1 = k * q[3 + c, w]
+                q2 = k * q[6 + c, w]
+                q3 = k * q[9 + c, w]
+                r = grad[3 * c, w] * g0
+                s = grad[3 * c + 1, w] * g1
+                t = grad[3 * c + 2, w] * g2
+                e0 = -s - t + q1
+                e1 = s - t - q1
+                e2 = t - s - q1
+                e3 = s + t + q1
+                o0 = r - q0 - q2 + q3
+                o1 = r + q0 - q2 - q3
+                o2 = r - q0 + q2 - q3
+                o3 = r + q0 + q2 + q3
+                force[0, w] = e0 - o0
+                force[1, w] = e0 + o0
+                force[2, w] = e1 + o1
+                force[3, w] = e1 - o1
+                force[4, w] = e2 - o2
+                force[5, w] = e2 + o2
+                force[6, w] = e3 + o3
+                force[7, w] = e3 - o3
+            for a in range(8):
+                first = start[a, run]
+                for w in range(n):
+                    fc[first + w] += force[a, w]
+    return smallest
+
+
+@_kernel
+def voxel_survey(u, start, length, first_cell, scale, coefficient, gram, required, factor, jacobian):  # type: ignore[no-untyped-def]
+    """Strain energy and hourglass energy (J); writes each cell's J into jacobian (n_cells + 1,).
+
+    Adds to required (n_nodes,), kg, the mass that each cell asks of its nodes: factor (s^2) times the bound of its
+    largest eigenvalue. first_cell (n_runs,): a run's cell w is first_cell + w. gram (3, n_runs), 1/m^2: the diagonal
+    of B^T B.
+    """
+    one = u.dtype.type(1)
+    zero = u.dtype.type(0)
+    eight = u.dtype.type(8)
+    grad = np.empty((9, _VL), u.dtype)
+    q = np.empty((12, _VL), u.dtype)
+    value = np.empty((3, _VL), u.dtype)
+    strain = 0.0
+    hourglass = 0.0
+    for run in range(U(start.shape[1])):
+        n = length[run]
+        mu = coefficient[0, run]
+        lam = coefficient[1, run]
+        k = coefficient[2, run]
+        b0 = gram[0, run]
+        b1 = gram[1, run]
+        b2 = gram[2, run]
+        _voxel_modes(u, start, run, n, scale[0, run], scale[1, run], scale[2, run], grad, q)
+        for w in range(n):
+            r = _energy_and_bound(
+                grad[0, w], grad[1, w], grad[2, w], grad[3, w], grad[4, w], grad[5, w], grad[6, w], grad[7, w],
+                grad[8, w], mu, lam, b0, zero, zero, b1, zero, b2, one,
+            )  # fmt: skip
+            value[0, w] = r[0]
+            value[1, w] = r[1]
+            value[2, w] = factor * (r[2] + eight * k)
+        for w in range(n):
+            jacobian[first_cell[run] + w] = value[0, w]
+            strain += value[1, w] - mu * np.log(value[0, w])
+        for m in range(12):
+            for w in range(n):
+                hourglass += k * q[m, w] * q[m, w]
+        for a in range(8):
+            first = start[a, run]
+            for w in range(n):
+                required[first + w] += value[2, w]
+    return strain, 0.5 * hourglass
+
+
+# ---------------------------------------------------------------- general hexahedra, gathered
+
+
+@_inline
+def _hexahedron_modes(u, nodes, geometry, batch, grad, q):  # type: ignore[no-untyped-def]
+    """grad u (9, lanes) with the mean gradient, and gamma^T u (12, lanes) = H^T u - (x^T H)^T grad u (eq. 4.21)."""
+    u0 = np.empty((8, _BL), u.dtype)
+    for c in range(3):
+        uc = u[c]
+        for a in range(8):
+            for w in range(_BL):
+                u0[a, w] = uc[nodes[batch, a, w]]
+        for w in range(_BL):
+            p0 = u0[0, w] + u0[1, w]
+            m0 = u0[1, w] - u0[0, w]
+            p1 = u0[3, w] + u0[2, w]
+            m1 = u0[2, w] - u0[3, w]
+            p2 = u0[4, w] + u0[5, w]
+            m2 = u0[5, w] - u0[4, w]
+            p3 = u0[7, w] + u0[6, w]
+            m3 = u0[6, w] - u0[7, w]
+            dm = m1 - m0
+            dn = m3 - m2
+            dp = p1 - p0
+            dq = p3 - p2
+            r = (m0 + m1) + (m2 + m3)
+            s = dp + dq
+            t = (p2 + p3) - (p0 + p1)
+            rs = dm + dn
+            st = dq - dp
+            rt = (m2 - m0) + (m3 - m1)
+            g = geometry[batch]
+            gx = r * g[0, w] + s * g[3, w] + t * g[6, w] + rs * g[9, w] + st * g[12, w] + rt * g[15, w]
+            gy = r * g[1, w] + s * g[4, w] + t * g[7, w] + rs * g[10, w] + st * g[13, w] + rt * g[16, w]
+            gz = r * g[2, w] + s * g[5, w] + t * g[8, w] + rs * g[11, w] + st * g[14, w] + rt * g[17, w]
+            grad[3 * c, w] = gx
+            grad[3 * c + 1, w] = gy
+            grad[3 * c + 2, w] = gz
+            q[c, w] = rs - (gx * g[18, w] + gy * g[19, w] + gz * g[20, w])
+            q[3 + c, w] = st - (gx * g[21, w] + gy * g[22, w] + gz * g[23, w])
+            q[6 + c, w] = rt - (gx * g[24, w] + gy * g[25, w] + gz * g[26, w])
+            q[9 + c, w] = (dn - dm) - (gx * g[27, w] + gy * g[28, w] + gz * g[29, w])
+
+
+@_kernel
+def hexahedron_forces(u, f, nodes, geometry, coefficient):  # type: ignore[no-untyped-def]
+    """Add the nodal forces of hexahedra of any shape to f; the smallest J among them.
+
+    nodes (n_batches, 8, lanes) uint32. geometry (n_batches, 30, lanes): the mean gradient of the sign vectors r, s, t,
+    rs, st, rt in x, y, z (1/m; that of rst is zero), then x^T H (m) of rs, st, rt, rst. coefficient (n_batches, 3,
+    lanes): mu V, lambda V (J), hourglass stiffness k (N/m); zero in lanes that only fill the last batch.
+    """
+    one = u.dtype.type(1)
+    grad = np.empty((9, _BL), u.dtype)
+    q = np.empty((12, _BL), u.dtype)
+    force = np.empty((8, _BL), u.dtype)
+    jacobian = np.full(_BL, np.inf).astype(u.dtype)
+    for batch in range(U(nodes.shape[0])):
+        _hexahedron_modes(u, nodes, geometry, batch, grad, q)
+        for w in range(_BL):
+            p = _first_piola(
+                grad[0, w], grad[1, w], grad[2, w], grad[3, w], grad[4, w], grad[5, w], grad[6, w], grad[7, w],
+                grad[8, w], coefficient[batch, 0, w], coefficient[batch, 1, w], one,
+            )  # fmt: skip
+            grad[0, w] = p[0]
+            grad[1, w] = p[1]
+            grad[2, w] = p[2]
+            grad[3, w] = p[3]
+            grad[4, w] = p[4]
+            grad[5, w] = p[5]
+            grad[6, w] = p[6]
+            grad[7, w] = p[7]
+            grad[8, w] = p[8]
+            jacobian[w] = min(jacobian[w], p[9])
+        for c in range(3):
+            fc = f[c]
+            for w in range(_BL):
+                g = geometry[batch]
+                k = coefficient[batch, 2, w]
+                q0 = k * q[c, w]
+                q1 = k * q[3 + c, w]
+                q2 = k * q[6 + c, w]
+                q3 = k * q[9 + c, w]
+                # gamma = H - B (x^T H): its second part acts as a stress
+                px = grad[3 * c, w] - (g[18, w] * q0 + g[21, w] * q1 + g[24, w] * q2 + g[27, w] * q3)
+                py = grad[3 * c + 1, w] - (g[19, w] * q0 + g[22, w] * q1 + g[25, w] * q2 + g[28, w] * q3)
+                pz = grad[3 * c + 2, w] - (g[20, w] * q0 + g[23, w] * q1 + g[26, w] * q2 + g[29, w] * q3)
+                r = px * g[0, w] + py * g[1, w] + pz * g[2, w]
+                s = px * g[3, w] + py * g[4, w] + pz * g[5, w]
+                t = px * g[6, w] + py * g[7, w] + pz * g[8, w]
+                q0 += px * g[9, w] + py * g[10, w] + pz * g[11, w]
+                q1 += px * g[12, w] + py * g[13, w] + pz * g[14, w]
+                q2 += px * g[15, w] + py * g[16, w] + pz * g[17, w]
+                e0 = -s - t + q1
+                e1 = s - t - q1
+                e2 = t - s - q1
+                e3 = s + t + q1
+                o0 = r - q0 - q2 + q3
+                o1 = r + q0 - q2 - q3
+                o2 = r - q0 + q2 - q3
+                o3 = r + q0 + q2 + q3
+                force[0, w] = e0 - o0
+                force[1, w] = e0 + o0
+                force[2, w] = e1 + o1
+                force[3, w] = e1 - o1
+                force[4, w] = e2 - o2
+                force[5, w] = e2 + o2
+                force[6, w] = e3 + o3
+                force[7, w] = e3 - o3
+            for a in range(8):
+                for w in range(_BL):
+                    fc[nodes[batch, a, w]] += force[a, w]
+    return jacobian.min()
+
+
+@_inline
+def _batch_survey(grad, coefficient, gram, stiffness, batch, value, one):  # type: ignore[no-untyped-def]
+    """J, strain energy and eigenvalue bound of a batch's lanes (3, lanes) from grad u."""
+    for w in range(_BL):
+        g = gram[batch]
+        r = _energy_and_bound(
+            grad[0, w], grad[1, w], grad[2, w], grad[3, w], grad[4, w], grad[5, w], grad[6, w], grad[7, w], grad[8, w],
+            coefficient[batch, 0, w], coefficient[batch, 1, w], g[0, w], g[1, w], g[2, w], g[3, w], g[4, w], g[5, w],
+            one,
+        )  # fmt: skip
+        value[0, w] = r[0]
+        value[1, w] = r[1]
+        value[2, w] = r[2] + stiffness[batch, w]
+    for w in range(_BL):
+        value[1, w] -= coefficient[batch, 0, w] * np.log(value[0, w])
+
+
+@_kernel
+def hexahedron_survey(u, nodes, cells, geometry, coefficient, gram, stiffness, required, factor, jacobian):  # type: ignore[no-untyped-def]
+    """As `voxel_survey`, of hexahedra of any shape.
+
+    cells (n_batches, lanes): the cell of each lane, n_cells where it only fills the last batch. gram (n_batches, 6,
+    lanes), 1/m^2: B^T B (xx, xy, xz, yy, yz, zz). stiffness (n_batches, lanes), N/m: the largest eigenvalue of the
+    hourglass stiffness.
+    """
+    one = u.dtype.type(1)
+    grad = np.empty((9, _BL), u.dtype)
+    q = np.empty((12, _BL), u.dtype)
+    value = np.empty((3, _BL), u.dtype)
+    strain = 0.0
+    hourglass = 0.0
+    for batch in range(U(nodes.shape[0])):
+        _hexahedron_modes(u, nodes, geometry, batch, grad, q)
+        _batch_survey(grad, coefficient, gram, stiffness, batch, value, one)
+        for w in range(_BL):
+            jacobian[cells[batch, w]] = value[0, w]
+            strain += value[1, w]
+        for m in range(12):
+            for w in range(_BL):
+                hourglass += coefficient[batch, 2, w] * q[m, w] * q[m, w]
+        for a in range(8):
+            for w in range(_BL):
+                required[nodes[batch, a, w]] += factor * value[2, w]
+    return strain, 0.5 * hourglass
+
+
+# ---------------------------------------------------------------- support domains, gathered
+
+
+@_inline
+def _domain_modes(u, nodes, gradient, batch, ue, grad, members):  # type: ignore[no-untyped-def]
+    """Nodal displacements (3, n, lanes) and grad u (9, lanes) of a batch of support domains."""
+    n = U(len(members))
+    zero = u.dtype.type(0)
+    for a in range(n):
+        for w in range(_BL):
+            k = U(nodes[batch, a, w])
+            ue[0, a, w] = u[0, k]
+            ue[1, a, w] = u[1, k]
+            ue[2, a, w] = u[2, k]
+    for c in range(U(3)):
+        for w in range(_BL):
+            x = zero
+            y = zero
+            z = zero
+            for a in range(n):
+                v = ue[c, a, w]
+                x += v * gradient[batch, 3 * a, w]
+                y += v * gradient[batch, 3 * a + 1, w]
+                z += v * gradient[batch, 3 * a + 2, w]
+            grad[3 * c, w] = x
+            grad[3 * c + 1, w] = y
+            grad[3 * c + 2, w] = z
+
+
+@_inline
+def _project(ue, position, inverse, batch, members):  # type: ignore[no-untyped-def]
+    """ue <- Q ue (3, n, lanes), Q = I - P (P^T P)^-1 P^T the unweighted linear projector of the domain's nodes.
+
+    With positions X from their mean and A = (X^T X)^-1 it is u_a - mean u - (A X^T u) . X_a: symmetric, so forces along
+    it keep linear and angular momentum, and zero for affine u.
+    """
+    n = U(len(members))
+    zero = ue.dtype.type(0)
+    share = ue.dtype.type(1) / ue.dtype.type(len(members))
+    i = inverse[batch]
+    for c in range(U(3)):
+        for w in range(_BL):
+            s = zero
+            x = zero
+            y = zero
+            z = zero
+            for a in range(n):
+                v = ue[c, a, w]
+                s += v
+                x += v * position[batch, 3 * a, w]
+                y += v * position[batch, 3 * a + 1, w]
+                z += v * position[batch, 3 * a + 2, w]
+            s *= share
+            hx = i[0, w] * x + i[1, w] * y + i[2, w] * z
+            hy = i[1, w] * x + i[3, w] * y + i[4, w] * z
+            hz = i[2, w] * x + i[4, w] * y + i[5, w] * z
+            for a in range(n):
+                ue[c, a, w] -= (
+                    s
+                    + hx * position[batch, 3 * a, w]
+                    + hy * position[batch, 3 * a + 1, w]
+                    + hz * position[batch, 3 * a + 2, w]
+                )
+
+
+@_kernel
+def domain_forces(u, f, nodes, gradient, position, inverse, coefficient, members):  # type: ignore[no-untyped-def]
+    """Add the nodal forces of support domains to f; the smallest J among them.
+
+    nodes (n_batches, n, lanes) uint32; gradient and position (n_batches, 3 n, lanes), 1/m and m; inverse (n_batches, 6,
+    lanes), 1/m^2; coefficient (n_batches, 3, lanes): mu V, lambda V (J), stabilisation kappa (N/m). position and
+    inverse are None where there is no stabilisation (the paper's own). members is a tuple of length n: a fact of its
+    type, so that the compiler unrolls the loops over a domain's nodes.
+    """
+    n = U(len(members))
+    one = u.dtype.type(1)
+    zero = u.dtype.type(0)
+    share = one / u.dtype.type(len(members))
+    ue = np.empty((3, len(members), _BL), u.dtype)
+    grad = np.empty((9, _BL), u.dtype)
+    smallest = u.dtype.type(np.inf)
+    for batch in range(U(nodes.shape[0])):
+        for a in range(n):
+            for w in range(_BL):
+                k = U(nodes[batch, a, w])
+                ue[0, a, w] = u[0, k]
+                ue[1, a, w] = u[1, k]
+                ue[2, a, w] = u[2, k]
+        # One pass over the nodes for the gradient and the affine part: `_domain_modes` and `_project` in one.
+        for c in range(U(3)):
+            for w in range(_BL):
+                gx = zero
+                gy = zero
+                gz = zero
+                s = zero
+                x = zero
+                y = zero
+                z = zero
+                for a in range(n):
+                    v = ue[c, a, w]
+                    gx += v * gradient[batch, 3 * a, w]
+                    gy += v * gradient[batch, 3 * a + 1, w]
+                    gz += v * gradient[batch, 3 * a + 2, w]
+                    if position is not None:
+                        s += v
+                        x += v * position[batch, 3 * a, w]
+                        y += v * position[batch, 3 * a + 1, w]
+                        z += v * position[batch, 3 * a + 2, w]
+                grad[3 * c, w] = gx
+                grad[3 * c + 1, w] = gy
+                grad[3 * c + 2, w] = gz
+                if position is not None:
+                    s *= share
+                    i0 = inverse[batch, 0, w]
+                    i1 = inverse[batch, 1, w]
+                    i2 = inverse[batch, 2, w]
+                    i3 = inverse[batch, 3, w]
+                    i4 = inverse[batch, 4, w]
+                    i5 = inverse[batch, 5, w]
+                    hx = i0 * x + i1 * y + i2 * z
+                    hy = i1 * x + i3 * y + i4 * z
+                    hz = i2 * x + i4 * y + i5 * z
+                    for a in range(n):
+                        ue[c, a, w] = coefficient[batch, 2, w] * (
+                            ue[c, a, w]
+                            - s
+                            - hx * position[batch, 3 * a, w]
+                            - hy * position[batch, 3 * a + 1, w]
+                            - hz * position[batch, 3 * a + 2, w]
+                        )
+                else:
+                    for a in range(n):
+                        ue[c, a, w] = zero
+        for w in range(_BL):
+            p = _first_piola(
+                grad[0, w], grad[1, w], grad[2, w], grad[3, w], grad[4, w], grad[5, w], grad[6, w], grad[7, w],
+                grad[8, w], coefficient[batch, 0, w], coefficient[batch, 1, w], one,
+            )  # fmt: skip
+            grad[0, w] = p[0]
+            grad[1, w] = p[1]
+            grad[2, w] = p[2]
+            grad[3, w] = p[3]
+            grad[4, w] = p[4]
+            grad[5, w] = p[5]
+            grad[6, w] = p[6]
+            grad[7, w] = p[7]
+            grad[8, w] = p[8]
+            smallest = min(smallest, p[9])
+        for c in range(U(3)):
+            for w in range(_BL):
+                for a in range(n):
+                    ue[c, a, w] += (
+                        grad[3 * c, w] * gradient[batch, 3 * a, w]
+                        + grad[3 * c + 1, w] * gradient[batch, 3 * a + 1, w]
+                        + grad[3 * c + 2, w] * gradient[batch, 3 * a + 2, w]
+                    )
+        for a in range(n):
+            for w in range(_BL):
+                k = U(nodes[batch, a, w])
+                f[0, k] += ue[0, a, w]
+                f[1, k] += ue[1, a, w]
+                f[2, k] += ue[2, a, w]
+    return smallest
+
+
+@_kernel
+def domain_survey(  # type: ignore[no-untyped-def]
+    u, nodes, cells, gradient, position, inverse, coefficient, gram, stiffness, required, factor, jacobian, members
+):
+    """As `hexahedron_survey`, of support domains: strain energy and stabilisation energy."""
+    n = U(len(members))
+    one = u.dtype.type(1)
+    ue = np.empty((3, len(members), _BL), u.dtype)
+    grad = np.empty((9, _BL), u.dtype)
+    value = np.empty((3, _BL), u.dtype)
+    strain = 0.0
+    stabilisation = 0.0
+    for batch in range(U(nodes.shape[0])):
+        _domain_modes(u, nodes, gradient, batch, ue, grad, members)
+        _batch_survey(grad, coefficient, gram, stiffness, batch, value, one)
+        for w in range(_BL):
+            jacobian[cells[batch, w]] = value[0, w]
+            strain += value[1, w]
+        if position is not None:
+            _project(ue, position, inverse, batch, members)
+            for c in range(U(3)):
+                for a in range(n):
+                    for w in range(_BL):
+                        stabilisation += coefficient[batch, 2, w] * ue[c, a, w] * ue[c, a, w]
+        for a in range(n):
+            for w in range(_BL):
+                required[nodes[batch, a, w]] += factor * value[2, w]
+    return strain, 0.5 * stabilisation
+
+
+# ---------------------------------------------------------------- nodes
+
+
+@_kernel
+def react(u, u_prev, f, mass, dofs, full, amplitude, reaction, time_step):  # type: ignore[no-untyped-def]
+    """Work (J) of the reactions at moving dofs over the last step, by the trapezoidal rule; renews the reactions.
+
+    A reaction is f + m a, a being the central difference to the place that the dof is moved to next (4.2.1: the
+    displaced nodes take u_max d(t + dt)). dofs, full (n,): 3 node + direction and metres at full load.
+    """
+    work = 0.0
+    for p in range(dofs.size):
+        node = dofs[p] // 3
+        c = dofs[p] % 3
+        now = u[c, node]
+        before = u_prev[c, node]
+        r = f[c, node] + mass[node] * (amplitude * full[p] - 2 * now + before) / (time_step * time_step)
+        work += 0.5 * (r + reaction[p]) * (now - before)
+        reaction[p] = r
+    return work
+
+
+@_kernel
+def update(u, u_prev, f, mobility, fixed, dofs, full, amplitude):  # type: ignore[no-untyped-def]
+    """The central difference (eq. 3.3, with the square on dt that 3.2 lacks), then the prescribed dofs; clears f.
+
+    mobility (n_nodes,) is dt^2 / m, s^2/kg. The new displacements overwrite u_prev: the caller swaps the two.
+    fixed (n,) are the dofs that stay, dofs and full (m,) those that move.
+    """
+    zero = u.dtype.type(0)
+    for c in range(3):
+        now = u[c]
+        before = u_prev[c]
+        fc = f[c]
+        for n in range(U(mobility.size)):
+            before[n] = (now[n] - before[n]) + now[n] - mobility[n] * fc[n]
+            fc[n] = zero
+    for p in range(fixed.size):
+        u_prev[fixed[p] % 3, fixed[p] // 3] = zero
+    for p in range(dofs.size):
+        u_prev[dofs[p] % 3, dofs[p] // 3] = amplitude * full[p]
+
+
+@njit(cache=True)
+def kinetic_energy(u, u_prev, f, mass, counted, held, time_step):  # type: ignore[no-untyped-def]
+    """Kinetic energy (J) of the counted nodes at the middle of the two half steps around u.
+
+    held (n,) are the prescribed dofs: theirs is taken from the last half step, for f does not move them.
+    No fast arithmetic here: a NaN anywhere must come out as NaN.
+    """
+    energy = 0.0
+    for c in range(3):
+        for n in range(counted.size):
+            if counted[n]:
+                v = (u[c, n] - u_prev[c, n]) / time_step - 0.5 * time_step * f[c, n] / mass[n]
+                energy += 0.5 * mass[n] * v * v
+    for p in range(held.size):
+        n = held[p] // 3
+        c = held[p] % 3
+        if counted[n]:
+            v = (u[c, n] - u_prev[c, n]) / time_step
+            w = v - 0.5 * time_step * f[c, n] / mass[n]
+            energy += 0.5 * mass[n] * (v * v - w * w)
+    return energy
+
+
+@njit(cache=True)
+def raise_mass(u, u_prev, mass, mobility, required, counted, time_step):  # type: ignore[no-untyped-def]
+    """Raise each node's mass to what is required; added mass (kg, times 3 directions not counted) and energy (J).
+
+    The nodes go on at their speed, so that 1/2 dm v^2 comes into the system: a line of the ledger of its own.
+    """
+    added = 0.0
+    energy = 0.0
+    for n in range(required.size):
+        dm = required[n] - mass[n]
+        if dm > 0:
+            mass[n] = required[n]
+            mobility[n] = time_step * time_step / required[n]
+            if counted[n]:
+                added += dm
+                for c in range(3):
+                    v = (u[c, n] - u_prev[c, n]) / time_step
+                    energy += 0.5 * dm * v * v
+    return added, energy
+
+
+@_kernel
+def pack(values, nodes, buffer):  # type: ignore[no-untyped-def]
+    """buffer (k, n) <- values (k, :) at the nodes (n,)."""
+    for c in range(values.shape[0]):
+        for i in range(U(nodes.size)):
+            buffer[c, i] = values[c, nodes[i]]
+
+
+@_kernel
+def clear(values, nodes):  # type: ignore[no-untyped-def]
+    """values (k, :) <- 0 at the nodes (n,)."""
+    zero = values.dtype.type(0)
+    for c in range(values.shape[0]):
+        for i in range(U(nodes.size)):
+            values[c, nodes[i]] = zero
+
+
+@_kernel
+def unpack(values, nodes, buffer):  # type: ignore[no-untyped-def]
+    """values (k, :) += buffer (k, n) at the nodes (n,)."""
+    for c in range(values.shape[0]):
+        for i in range(U(nodes.size)):
+            values[c, nodes[i]] += buffer[c, i]

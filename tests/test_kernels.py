@@ -1,0 +1,354 @@
+"""The kernels against the paper's plain formulas in numpy, and the physics that no rounding may hide."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from mpitled import hexahedra
+from mpitled.material import Material, first_piola, strain_energy
+from mpitled.mesh import CORNERS, grid_points, structured_hexahedra
+from mpitled.step import State, Survey, compose, start
+from mpitled.store import PartRows
+from mpitled.subdomain import localise
+
+BRAIN = Material("brain", 3000.0, 0.49, 1000.0)
+SOFT = Material("soft", 10.0, 0.1, 1000.0)
+HOURGLASS = 0.04 / 9
+R, S, T = CORNERS.T
+MODES = np.stack([R * S, S * T, R * T, R * S * T], axis=1)
+
+
+def part(points, cells, domains, gradients, volumes, material, prescribed=((), ())):
+    """A whole model as the only part, in the order of its own numbers."""
+    n, n_domains = len(points), len(domains)
+    nothing = np.zeros(0, np.int64)
+    return PartRows(
+        n_parts=1,
+        part=0,
+        n_nodes=n,
+        n_fe_nodes=n if not n_domains else len(np.unique(cells)),
+        n_hexahedra=len(cells),
+        n_domains=n_domains,
+        cells=np.arange(len(cells) + n_domains),
+        nodes=np.arange(n),
+        node_ids=np.arange(n),
+        rows=np.arange(n),
+        owned=np.ones(n, bool),
+        first_row=0,
+        points=points,
+        mass=np.ones(n),
+        hexahedra=cells,
+        domains=domains,
+        domain_points=points[domains].mean(axis=1),
+        domain_volumes=volumes,
+        domain_gradients=gradients,
+        domain_shapes=np.full(domains.shape, 1 / 8),
+        material=np.asarray(material, np.int16),
+        materials=(BRAIN, SOFT),
+        prescribed_dofs=np.asarray(prescribed[0], np.int64),
+        prescribed_displacements=np.asarray(prescribed[1], float),
+        field_nodes=nothing,
+        field_domains=nothing,
+        field_shapes=np.zeros((0, 8)),
+        neighbours=nothing.astype(np.int32),
+        shared=nothing,
+        shared_offsets=np.zeros(1, np.int64),
+    )
+
+
+def no_domains():
+    return np.zeros((0, 8), np.int64), np.zeros((0, 8, 3)), np.zeros(0)
+
+
+def box(shape=(37, 3, 2), edge=2e-3, distortion=0.0, seed=0):
+    points = grid_points(shape, tuple(edge * n for n in shape))
+    points += np.random.default_rng(seed).uniform(-distortion, distortion, points.shape) * edge
+    cells = structured_hexahedra(shape)
+    material = (np.arange(len(cells)) // 37) % 2
+    return points, cells, material
+
+
+def cloud(n=90, n_domains=53, per_domain=8, seed=0):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0, 0.01, (n, 3))
+    domains = np.array([rng.choice(n, per_domain, replace=False) for _ in range(n_domains)])
+    centred = points[domains] - points[domains].mean(axis=1, keepdims=True)
+    gradients = centred @ np.linalg.inv(np.einsum("gai,gaj->gij", centred, centred))
+    return points, domains, gradients, rng.uniform(0.5, 1.5, n_domains) * 1e-9
+
+
+def plain(sub_rows, u, stabilisation, rule="mean"):
+    """Forces, strain energy, energy of the stabilised modes and J by the paper's formulas, one array operation each."""
+    f = np.zeros_like(u)
+    strain = resisted = 0.0
+    J = []
+    rows = sub_rows
+    lam = np.array([m.lam for m in rows.materials])[rows.material]
+    mu = np.array([m.mu for m in rows.materials])[rows.material]
+    n = len(rows.hexahedra)
+    kinds = []
+    if n:
+        B, V = hexahedra.geometry(rows.points, rows.hexahedra, rule)
+        x = rows.points[rows.hexahedra]
+        gamma = MODES - np.einsum("eai,ebi,bm->eam", B, x, MODES)
+        k = HOURGLASS * (lam[:n] + 2 * mu[:n]) * V * (B**2).sum((1, 2)) / 8
+        kinds.append((rows.hexahedra, B, V, k, np.einsum("eam,ebm->eab", gamma, gamma), slice(0, n)))
+    if len(rows.domains):
+        B, V = rows.domain_gradients, rows.domain_volumes
+        x = rows.points[rows.domains]
+        P = np.concatenate([np.ones((*x.shape[:2], 1)), x - x.mean(1, keepdims=True)], axis=2)
+        Q = np.eye(x.shape[1]) - P @ np.linalg.inv(np.swapaxes(P, 1, 2) @ P) @ np.swapaxes(P, 1, 2)
+        linear = (x - x.mean(1, keepdims=True)) @ np.linalg.inv(np.einsum("gai,gaj->gij", P[..., 1:], P[..., 1:]))
+        k = stabilisation * (lam[n:] + 2 * mu[n:]) * V * (linear**2).sum((1, 2)) / 8
+        kinds.append((rows.domains, B, V, k, Q, slice(n, None)))
+    for nodes, B, V, k, Q, these in kinds:
+        X = np.eye(3) + np.einsum("eai,eaj->eij", u[nodes], B)
+        P = np.stack([first_piola(x, a, b) for x, a, b in zip(X, lam[these], mu[these], strict=True)])
+        modes = k[:, None, None] * np.einsum("eab,ebi->eai", Q, u[nodes])
+        np.add.at(f, nodes, V[:, None, None] * np.einsum("eij,eaj->eai", P, B) + modes)
+        strain += sum(v * strain_energy(x, a, b) for v, x, a, b in zip(V, X, lam[these], mu[these], strict=True))
+        resisted += 0.5 * (modes * u[nodes]).sum()
+        J.append(np.linalg.det(X))
+    return f, strain, resisted, np.concatenate(J)
+
+
+def at(sub, u):
+    """A state with these displacements (n, 3)."""
+    state = start(sub, 10, 1e-4)
+    state.u[:, : len(u)] = u.T
+    return state
+
+
+def forces(sub, state):
+    for name, term in compose(sub, None):
+        if name != "update":
+            term(state)
+    return state.f[:, : sub.n_nodes].T
+
+
+SCENES = {
+    "voxels": lambda: part(*box()[:2], *no_domains(), box()[2]),
+    "distorted": lambda: part(*box(distortion=0.15)[:2], *no_domains(), box()[2]),
+    "voxels and distorted": lambda: mixed_shapes(),
+    "domains": lambda: all_domains(8),
+    "domains of 13 nodes": lambda: all_domains(13),
+}
+
+
+def mixed_shapes():
+    points, cells, material = box()
+    points[:40] += np.random.default_rng(3).uniform(-2e-4, 2e-4, (40, 3))
+    return part(points, cells, *no_domains(), material)
+
+
+def all_domains(n):
+    points, domains, gradients, volumes = cloud(per_domain=n)
+    return part(points, np.zeros((0, 8), np.int64), domains, gradients, volumes, np.arange(len(domains)) % 2)
+
+
+@pytest.mark.parametrize("rule", ["mean", "centre"])
+@pytest.mark.parametrize("stabilisation", [0.0, 0.1])
+@pytest.mark.parametrize("scene", SCENES)
+def test_forces_energies_and_jacobians_are_those_of_the_plain_formulas(scene, stabilisation, rule):
+    rows = SCENES[scene]()
+    sub = localise(rows, HOURGLASS, stabilisation, rule)
+    assert (sub.runs is not None) == ("voxels" in scene)
+    assert (sub.hexahedra is not None) == ("distorted" in scene)
+    u = np.random.default_rng(1).normal(size=rows.points.shape) * 1e-4
+    expected, strain, resisted, J = plain(rows, u, stabilisation, rule)
+    state = at(sub, u)
+    found = forces(sub, state).copy()
+    # Sums of some 50 products of each cell, and of 8 to 20 cells a node: tens of roundings.
+    assert np.abs(found - expected).max() < 1e-13 * np.abs(expected).max()
+    assert state.smallest_jacobian == pytest.approx(J.min(), rel=1e-14)
+    seen = Survey(sub, None, False, 1.0)
+    figures = seen.look(state)
+    assert seen.jacobian[:-1] == pytest.approx(J, rel=1e-13)
+    assert figures["strain"] == pytest.approx(strain, rel=1e-10)  # W is a small difference of (J - 1) and ln J
+    assert figures["hourglass"] + figures["stabilisation"] == pytest.approx(resisted, rel=1e-12)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_forces_are_the_gradient_of_the_energies(scene):
+    rows = SCENES[scene]()
+    sub = localise(rows, HOURGLASS, 0.1, "mean")
+    rng = np.random.default_rng(2)
+    u, direction = rng.normal(size=(2, *rows.points.shape)) * 1e-4
+
+    def energy(step):
+        figures = Survey(sub, None, False, 1.0).look(at(sub, u + step * direction))
+        return figures["strain"] + figures["hourglass"] + figures["stabilisation"]
+
+    h = 1e-3
+    slope = (8 * (energy(h) - energy(-h)) - (energy(2 * h) - energy(-2 * h))) / (12 * h)
+    # Truncation h^4 times fifth derivatives of order one, rounding 1e-16 / h.
+    assert slope == pytest.approx((forces(sub, at(sub, u)) * direction).sum(), rel=1e-9)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_no_force_from_rigid_motion_and_no_moment_from_any(scene):
+    rows = SCENES[scene]()
+    sub = localise(rows, HOURGLASS, 0.1, "mean")
+    rng = np.random.default_rng(4)
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    turn *= np.sign(np.linalg.det(turn))
+    rigid = rows.points @ turn.T - rows.points + [1e-3, 2e-3, -3e-3]
+    wild = rng.normal(size=rows.points.shape) * 1e-4
+    f = forces(sub, at(sub, wild)).copy()
+    scale = np.abs(f).sum()
+    assert np.abs(forces(sub, at(sub, rigid))).max() < 1e-12 * scale
+    assert np.abs(f.sum(axis=0)).max() < 1e-14 * scale
+    reach = np.abs(rows.points).max()
+    # Hourglass and stabilising forces act along the reference frame, not the turned one: they keep the moment about
+    # reference places, while stress keeps that about present ones.
+    moment = np.cross(rows.points + wild, f).sum(axis=0)
+    modes = np.cross(wild, f - plain_stress(rows, wild)).sum(axis=0)
+    assert np.abs(moment - modes).max() < 1e-13 * scale * reach
+
+
+def plain_stress(rows, u):
+    """Forces of the stress alone: those of the plain formulas less the stabilised modes."""
+    global HOURGLASS
+    kept, HOURGLASS = HOURGLASS, 0.0
+    try:
+        return plain(rows, u, 0.0)[0]
+    finally:
+        HOURGLASS = kept
+
+
+@pytest.mark.parametrize("distortion", [0.0, 0.2])
+def test_patch_constant_stress_balances_at_inner_nodes(distortion):
+    """The centre-point gradient of eq. 4.6 misses this by 8e-3 on a distorted mesh."""
+    shape = (9, 4, 4)
+    points, cells, _ = box(shape, distortion=distortion)
+    sub = localise(part(points, cells, *no_domains(), np.zeros(len(cells))), HOURGLASS, 0.0, "mean")
+    gradient = np.array([[0.2, 0.05, 0.0], [0.0, -0.09, 0.03], [0.02, 0.0, -0.09]])
+    f = forces(sub, at(sub, points @ gradient.T))
+    grid = np.indices((shape[2] + 1, shape[1] + 1, shape[0] + 1)).reshape(3, -1)
+    inner = ((grid > 0) & (grid < np.array(shape)[::-1, None])).all(axis=0)
+    assert np.abs(f[inner]).max() < 1e-13 * np.abs(f).max()
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("stretch", [0.0, 0.6])
+def test_the_bound_holds_the_true_stiffness(scene, stretch):
+    """Every nodal mass that the survey asks for makes the assembled tangent's largest frequency harmless.
+
+    M - dt^2 / 4 K must be positive semidefinite: by central differences of the forces, a dense tangent.
+    """
+    rows = SCENES[scene]()
+    keep = slice(0, 24) if len(rows.hexahedra) else slice(0, 16)
+    if len(rows.hexahedra):
+        used = np.unique(rows.hexahedra[keep])
+        rows = part(rows.points[used], np.searchsorted(used, rows.hexahedra[keep]), *no_domains(), rows.material[keep])
+    else:
+        points, domains, gradients, volumes = cloud(n=24, n_domains=16)
+        rows = part(points, np.zeros((0, 8), np.int64), domains, gradients, volumes, np.arange(16) % 2)
+    sub = localise(rows, HOURGLASS, 0.1, "mean")
+    rng = np.random.default_rng(5)
+    deform = np.diag([1 + stretch, 1 / (1 + stretch), 1.02]) - np.eye(3)
+    u = rows.points @ deform + rng.normal(size=rows.points.shape) * 1e-5
+    n = u.size
+    K = np.empty((n, n))
+    h = 1e-7
+    for i in range(n):
+        step = np.zeros(n)
+        step[i] = h
+        step = step.reshape(u.shape)
+        K[i] = (forces(sub, at(sub, u + step)).ravel() - forces(sub, at(sub, u - step)).ravel()) / (2 * h)
+    survey = Survey(sub, None, False, 1.0)
+    state = at(sub, u)
+    state.time_step = 2.0
+    survey.look(state)
+    mass = np.repeat(survey.required[0], 3)
+    root = 1 / np.sqrt(mass)
+    largest = np.linalg.eigvalsh(root[:, None] * (K + K.T) / 2 * root)[-1]
+    assert 0.1 < largest <= 1.0
+
+
+def test_a_step_allocates_nothing():
+    """Every array of a step is there before it: numpy makes none of a node's or a cell's size in a thousand steps."""
+    import tracemalloc
+
+    points, cells, _ = box((60, 12, 12))
+    points[:40] += 1e-5
+    sub = localise(part(points, cells, *no_domains(), np.zeros(len(cells))), HOURGLASS, 0.1, "mean")
+    terms = compose(sub, None)
+    state: State = start(sub, 2000, 1e-5)
+    for _, term in terms:
+        term(state)
+    tracemalloc.start()
+    for _ in range(1000):
+        for _, term in terms:
+            term(state)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 8 * sub.n_nodes  # less than one nodal array of one component
+
+
+def test_energy_is_kept_by_the_central_difference():
+    """A block let go from a stretch: the sum of energies swings by O(dt^2), and does not drift."""
+    points, cells, _ = box((6, 5, 4))
+    rows = part(points, cells, *no_domains(), np.zeros(len(cells)))
+    sub = localise(rows, HOURGLASS, 0.0, "mean")
+    terms = compose(sub, None)
+
+    def swing(time_step):
+        state = start(sub, 10**6, time_step)
+        state.mass[:] = 1e-5
+        state.mobility[:] = time_step**2 / state.mass
+        state.u[:, : sub.n_nodes] = (points * [0.05, -0.02, -0.02]).T
+        state.u_prev[:] = state.u
+        survey = Survey(sub, None, False, 1.0)
+        energies = []
+        for _ in range(round(4e-2 / time_step)):
+            for _, term in terms[:-1]:
+                term(state)
+            figures = survey.look(state)
+            energies.append(figures["strain"] + figures["hourglass"] + figures["kinetic"])
+            terms[-1][1](state)
+        energies = np.array(energies)
+        return np.abs(energies - energies[1]).max() / energies[1]
+
+    coarse, fine = swing(2e-4), swing(1e-4)
+    assert coarse < 0.1
+    assert coarse / fine > 3  # 4 for a second-order method
+
+
+@pytest.mark.study
+def test_speed():
+    """Million cells a second on one core, of each kernel, and the cost of a support domain in hexahedra."""
+    for name, rows in {
+        "voxels": part(*box((64, 64, 64))[:2], *no_domains(), np.zeros(64**3)),
+        "distorted": part(*box((64, 64, 64), distortion=0.1)[:2], *no_domains(), np.zeros(64**3)),
+        "domains": sorted_cloud(100_000),
+    }.items():
+        sub = localise(rows, HOURGLASS, 0.1, "mean")
+        terms = dict(compose(sub, None))
+        state = start(sub, 10**6, 1e-9)
+        seconds = {term: [] for term in terms}
+        for _ in range(15):
+            for term, act in terms.items():
+                begin = time.perf_counter()
+                act(state)
+                seconds[term].append(time.perf_counter() - begin)
+        rates = {term: sub.n_cells / np.median(all_) / 1e6 for term, all_ in seconds.items()}
+        print(name, {term: f"{rate:.1f} M/s" for term, rate in rates.items()})
+        assert min(rates.values()) > 0
+
+
+def sorted_cloud(n_domains):
+    from scipy.spatial import cKDTree
+
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, 0.1, (n_domains // 3, 3))
+    points = points[np.lexsort(np.floor(points * 200).T)]
+    at = rng.uniform(0, 0.1, (n_domains, 3))
+    at = at[np.lexsort(np.floor(at * 200).T)]
+    domains = cKDTree(points).query(at, 8)[1]
+    centred = points[domains] - points[domains].mean(axis=1, keepdims=True)
+    gradients = centred @ np.linalg.inv(np.einsum("gai,gaj->gij", centred, centred))
+    return part(points, np.zeros((0, 8), np.int64), domains, gradients, np.full(n_domains, 1e-9), np.zeros(n_domains))
