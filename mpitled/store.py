@@ -106,6 +106,34 @@ def read_sets(path: Path) -> tuple[dict[str, NDArray[np.int64]], dict[str, NDArr
         return _read_sets(file["node_sets"]), _read_sets(file["cell_sets"])
 
 
+def read_figures(path: Path) -> dict[str, Any]:
+    """What the preprocessor counted and measured, by name."""
+    with _open_model(path) as file:
+        return _read_json(file, "figures")
+
+
+def describe_model(path: Path) -> str:
+    """Sizes, sets, materials and figures of a model, a line each."""
+    with _open_model(path) as file:
+        lines = [
+            f"nodes            {len(file['points'])} ({file.attrs['n_fe_nodes']} FE)",
+            f"hexahedra        {len(file['hexahedra'])}",
+            f"support domains  {len(file['domains'])} of {file['domains'].shape[1]} nodes",
+            f"prescribed dofs  {len(file['prescribed_dofs'])}",
+        ]
+        lines += [
+            f"material         {m.name}: E {m.youngs_modulus:g} Pa, nu {m.poissons_ratio:g}, {m.density:g} kg/m3"
+            for m in _read_materials(file)
+        ]
+        for kind in ("node_sets", "cell_sets"):
+            lines += [
+                f"{kind[:-1].replace('_', ' '):16} {name}: {len(v)}" for name, v in _read_sets(file[kind]).items()
+            ]
+        lines += [f"{name}: {value:.6g}" for name, value in _read_json(file, "figures").items()]
+        lines += list(_read_json(file, "remarks")) if "remarks" in file else []
+    return "\n".join(lines)
+
+
 @contextmanager
 def _open_model(path: Path) -> Iterator[h5py.File]:
     with _open(path) as file:

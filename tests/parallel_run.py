@@ -1,0 +1,44 @@
+"""Under mpirun: runs a deck and sees that all copies of a shared node have the same bits. DECK DIR"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from mpitled import run as runs
+from mpitled.deck import load_deck
+from mpitled.halo import World
+
+
+def main(deck: Path, directory: Path) -> None:
+    world = World()
+    loops = []
+
+    class Watched(runs._Loop):
+        def __init__(self, *arguments: object) -> None:
+            super().__init__(*arguments)  # type: ignore[arg-type]
+            loops.append(self)
+
+    runs._Loop = Watched  # type: ignore[misc]
+    runs.run(load_deck(deck), directory, world, quiet=True)
+    state, shared = loops[0].state, loops[0].sub.shared
+    compared = 0
+    for values in (state.u, state.u_prev, state.mass[None]):
+        mine = {rank: np.ascontiguousarray(values[:, nodes]) for rank, nodes in shared}
+        theirs = {rank: np.empty_like(block) for rank, block in mine.items()}
+        requests = [world.comm.Irecv(block, rank) for rank, block in theirs.items()]
+        requests += [world.comm.Isend(block, rank) for rank, block in mine.items()]
+        for request in requests:
+            request.Wait()
+        for rank, block in mine.items():
+            assert block.tobytes() == theirs[rank].tobytes(), f"ranks {world.rank} and {rank} differ"
+            compared += block.size
+    total = int(world.gather([compared])[:, 0].sum())
+    if world.leads:
+        print(total)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -1,0 +1,279 @@
+"""Whole runs from a deck: physics with a closed form, the contract of ranks, and how runs end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ENVIRONMENT, ROOT, complaint, mpitled, ranks, script
+from scipy.optimize import brentq
+
+from mpitled.loading import loading_curve
+from mpitled.run import LONGEST_UNWATCHED, schedule
+from mpitled.store import open_result
+
+#: A block that is stretched between two of its faces, which may slide: homogeneous whatever the mesh.
+STRETCH = """
+title = "homogeneous stretch"
+[block]
+size = [30.0, 24.0, 24.0]
+elements = [10, 8, 8]
+cloud = "{cloud}"
+[cloud]
+points_per_spacing = 1.4
+[material.brain]
+youngs_modulus = 3000.0
+poissons_ratio = 0.49
+[[fixed]]
+nodes = "x0"
+directions = ["x"]
+[[fixed]]
+nodes = "y0"
+directions = ["y"]
+[[fixed]]
+nodes = "z0"
+directions = ["z"]
+[[displaced]]
+nodes = "x1"
+directions = ["x"]
+displacement = [{millimetres}]
+[solver]
+load_time = {load_time}
+[output]
+frames = 2
+"""
+
+GROWTH = """
+title = "a tumour in a block"
+[block]
+size = [48.0, 40.0, 40.0]
+elements = [12, 10, 10]
+cloud = "core"
+[tumour]
+centre = [24.0, 20.0, 20.0]
+volume = {volume}
+[cloud]
+radius = 11.0
+[material.brain]
+youngs_modulus = 3000.0
+poissons_ratio = 0.49
+[[fixed]]
+nodes = "surface"
+[solver]
+load_time = 0.3
+[output]
+frames = 2
+"""
+
+
+def deck(folder: Path, text: str, **values: object) -> Path:
+    path = folder / "scene.toml"
+    path.write_text(text.format(**values))
+    return path
+
+
+def test_loading_curve_rests_at_both_ends():
+    s = np.linspace(0, 1, 1001)
+    d = np.array([loading_curve(x) for x in s])
+    assert (d[0], d[-1]) == (0, 1)
+    assert (np.diff(d) > 0).all()
+    assert abs(d[1]) < 1e-8  # 10 s^3
+    assert 1 - d[-2] < 1.1e-8
+
+
+@pytest.mark.parametrize(
+    ("load_time", "step", "frames"), [(2.0, 2.5e-4, 10), (0.01, 1e-3, 3), (1.0, 0.3, 7), (1, 1, 1)]
+)
+def test_surveys_and_frames_fall_on_steps(load_time, step, frames):
+    n_steps, between, surveys = schedule(load_time, step, frames)
+    assert load_time / n_steps <= step * (1 + 1e-9)
+    assert n_steps == between * surveys * frames
+    assert 1 <= between <= LONGEST_UNWATCHED
+
+
+@pytest.mark.parametrize("cloud", ["none", "core", "all"])
+def test_homogeneous_stretch_has_its_closed_form(tmp_path, cloud):
+    """Hexahedra only, the mixed mesh and support domains only, from the same step: 20 % of uniaxial stretch.
+
+    Exact is x -> (l x, m y, m z) with P_yy = mu m + q l m = 0, q = lambda (J - 1) - mu / J. What is left is the
+    dynamics of the ramp, whose size the kinetic energy tells: for a stiffness of the same order as the loaded one,
+    the error relative to the stretch is at most the root of kinetic over internal energy (both quadratic).
+    """
+    path = deck(tmp_path, STRETCH, cloud=cloud, millimetres=6.0, load_time=0.5)
+    mpitled("run", path, "--out", tmp_path / "out")
+    E, nu, stretch = 3000.0, 0.49, 1.2
+    lam, mu = E * nu / ((1 + nu) * (1 - 2 * nu)), E / (2 * (1 + nu))
+
+    def lateral_stress(m: float) -> float:
+        J = stretch * m * m
+        return mu * m + (lam * (J - 1) - mu / J) * stretch * m
+
+    m = brentq(lateral_stress, 0.8, 1.0, xtol=1e-15)
+    with open_result(tmp_path / "out") as result:
+        kinetic = result.figures["kinetic_to_internal"]
+        assert kinetic["at_end"] < 1e-4
+        exact = result.points * [stretch - 1, m - 1, m - 1]
+        error = np.abs(result.point_data("displacement", -1) - exact).max()
+        J = result.in_cells("J", -1)
+    assert error < 6e-3 * max(np.sqrt(kinetic["at_end"]), 1e-3)
+    assert np.abs(J - stretch * m * m).max() < max(np.sqrt(kinetic["at_end"]), 1e-3)
+
+
+def final(directory: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Displacements of nodes and of integration points in the last frame, in the order of the model."""
+    with open_result(directory) as result:
+        return result.at_nodes("field_displacement", -1), result.at_integration_points("displacement", -1)
+
+
+def test_one_two_and_four_ranks_agree_and_repeat(tmp_path):
+    """Growth to R/r0 = 2.5, J from 1 to far from it: sums in another order, and nothing else, between rank counts."""
+    path = deck(tmp_path, GROWTH, volume=523.6)
+    for n in (1, 2, 4):
+        mpitled("run", path, "--out", tmp_path / str(n), n=n)
+    mpitled("run", path, "--out", tmp_path / "again", n=2)
+    one = final(tmp_path / "1")
+    largest = np.abs(one[0]).max()
+    assert largest == pytest.approx(3e-3, rel=0.01)  # R - r0
+    for n in (2, 4):
+        for other, values in zip(final(tmp_path / str(n)), one, strict=True):
+            assert np.abs(other - values).max() < 1e-8 * largest
+    for other, values in zip(final(tmp_path / "again"), final(tmp_path / "2"), strict=True):
+        assert other.tobytes() == values.tobytes()
+
+
+def test_ranks_agree_to_round_off_in_the_linear_range(tmp_path):
+    path = deck(tmp_path, STRETCH, cloud="core", millimetres=0.01, load_time=0.1)
+    for n in (1, 2, 4):
+        mpitled("run", path, "--out", tmp_path / str(n), n=n)
+    one = final(tmp_path / "1")[0]
+    for n in (2, 4):
+        assert np.abs(final(tmp_path / str(n))[0] - one).max() < 1e-12 * np.abs(one).max()
+
+
+@pytest.mark.parametrize("n", [2, 4])
+def test_copies_of_shared_nodes_have_the_same_bits(tmp_path, n):
+    path = deck(tmp_path, GROWTH, volume=113.1)
+    compared = int(script("parallel_run.py", path, tmp_path / "out", n=n).splitlines()[-1])
+    assert compared > 1000
+
+
+def test_ranks_without_one_kind_of_cell(tmp_path):
+    """A cloud at one end: of four parts some have no support domains, or no hexahedra."""
+    text = GROWTH.replace("[48.0, 40.0, 40.0]", "[96.0, 20.0, 20.0]").replace("[12, 10, 10]", "[24, 5, 5]")
+    text = text.replace("[24.0, 20.0, 20.0]", "[12.0, 10.0, 10.0]").replace("radius = 11.0", "radius = 9.0")
+    path = deck(tmp_path, text, volume=60.0)
+    for n in (1, 4):
+        mpitled("run", path, "--out", tmp_path / str(n), n=n)
+    with open_result(tmp_path / "4") as result:
+        part, kind = result.cell_data("part"), result.cell_data("kind")
+    kinds = [set(kind[part == p]) for p in range(4)]
+    assert any(2 not in k for k in kinds)
+    one, four = final(tmp_path / "1")[0], final(tmp_path / "4")[0]
+    assert np.abs(one - four).max() < 1e-8 * np.abs(one).max()
+
+
+def test_model_is_used_again_until_the_scene_changes(tmp_path):
+    path = deck(tmp_path, STRETCH, cloud="core", millimetres=1.0, load_time=0.1)
+    build = lambda *more: mpitled("build", path, "--out", tmp_path / "out", *more).stdout.splitlines()[0]  # noqa: E731
+    assert build().endswith("built")
+    before = (tmp_path / "out" / "model.h5").read_bytes()
+    assert build().endswith("up to date")
+    assert build("--set", "solver.load_time=0.2").endswith("up to date")
+    assert build("--set", "material.brain.poissons_ratio=0.45").endswith("built")
+    assert build().endswith("built")
+    assert (tmp_path / "out" / "model.h5").read_bytes() == before  # bit for bit
+
+
+def test_partition_ahead_of_a_job(tmp_path):
+    path = deck(tmp_path, STRETCH, cloud="core", millimetres=1.0, load_time=0.05)
+    mpitled("build", path, "--out", tmp_path / "out")
+    table = mpitled("partition", tmp_path / "out", 2).stdout
+    for word in ("balance", "halo", "neighbours"):
+        assert word in table
+    refused = mpitled("partition", tmp_path / "out", 100_000, status=2)
+    assert "100000" in complaint(refused)
+
+
+# ------------------------------------------------------------ how runs end
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_bad_decks_end_with_one_line_on_all_ranks(tmp_path, n):
+    path = deck(tmp_path, STRETCH.replace("youngs_modulus", "young_modulus"), cloud="none", millimetres=1, load_time=1)
+    line = complaint(mpitled("run", path, "--out", tmp_path / "out", n=n, status=2))
+    assert "young_modulus" in line
+    assert "youngs_modulus" in line
+    path = deck(tmp_path, STRETCH.replace('"x1"', '"x2"'), cloud="none", millimetres=1, load_time=1)
+    line = complaint(mpitled("run", path, "--out", tmp_path / "out", n=n, status=2))
+    assert "'x2'" in line
+    assert "x1" in line  # what there is
+
+
+def test_more_ranks_than_cells_are_refused(tmp_path):
+    text = STRETCH.replace("[10, 8, 8]", "[1, 1, 2]")
+    path = deck(tmp_path, text, cloud="none", millimetres=0.1, load_time=0.1)
+    line = complaint(mpitled("run", path, "--out", tmp_path / "out", n=3, status=2))
+    assert "3" in line
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_an_unstable_run_stops_and_says_why(tmp_path, n):
+    path = deck(tmp_path, STRETCH, cloud="core", millimetres=3.0, load_time=1.0)
+    line = complaint(
+        mpitled(
+            "run", path, "--out", tmp_path / "out", "--set", "solver.time_step=3e-3", "--set",
+            "solver.mass_scaling=false", n=n, status=3,
+        )
+    )  # fmt: skip
+    assert "unstable" in line
+    assert "load_time" in line or "time_step" in line
+    with open_result(tmp_path / "out") as result:
+        assert not result.complete
+        assert result.n_frames >= 1
+
+
+@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_leaves_a_readable_file(tmp_path, signal_number):
+    path = deck(tmp_path, STRETCH, cloud="core", millimetres=3.0, load_time=500.0)
+    command = [str(Path(sys.executable).with_name("mpitled")), "run", path, "--out", tmp_path / "out", "--set"]
+    with subprocess.Popen(
+        [*command, "output.frames=20000"], env=ENVIRONMENT, cwd=ROOT, stderr=subprocess.PIPE, text=True
+    ) as process:
+        file = tmp_path / "out" / "result.partial.vtkhdf"
+        deadline = time.time() + 60
+        while not file.exists() and time.time() < deadline:
+            time.sleep(0.1)
+        time.sleep(1.0)
+        process.send_signal(signal_number)
+        _, errors = process.communicate(timeout=30)
+    assert process.returncode == 4, errors
+    assert "interrupted" in errors
+    with open_result(tmp_path / "out") as result:
+        assert not result.complete
+        assert result.n_frames >= 1
+
+
+def test_the_death_of_one_rank_ends_the_others(tmp_path):
+    path = deck(tmp_path, STRETCH, cloud="core", millimetres=3.0, load_time=500.0)
+    command = [*ranks(2), str(Path(sys.executable).with_name("mpitled")), "run", path, "--out", tmp_path / "out"]
+    with subprocess.Popen(command, env=ENVIRONMENT, cwd=ROOT, stderr=subprocess.DEVNULL) as process:
+        file = tmp_path / "out" / "result.partial.vtkhdf"
+        deadline = time.time() + 60
+        while not file.exists() and time.time() < deadline:
+            time.sleep(0.1)
+        time.sleep(0.5)
+        children = subprocess.run(["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, text=True)
+        os.kill(int(children.stdout.split()[0]), signal.SIGKILL)
+        assert process.wait(timeout=30) != 0
+
+
+def test_shipped_block_decks_run(tmp_path):
+    for path in sorted((ROOT / "jobs").glob("block_*.toml")):
+        mpitled("run", path, "--out", tmp_path / path.stem, "--set", "solver.load_time=0.2")
+        assert (tmp_path / path.stem / "result.vtkhdf").exists()
