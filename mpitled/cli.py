@@ -1,0 +1,136 @@
+"""The command line: `mpitled run|build|partition|report|info`."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from mpitled import __version__
+from mpitled.errors import InputError, MpitledError
+
+# Modules are imported by the command that needs them: `--help` must not wait for compilers and libraries.
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run a command; exit status 0 done, 1 broken, 2 bad input, 3 unstable, 4 interrupted."""
+    options = _parser().parse_args(arguments)
+    try:
+        status = options.command(options)
+    except MpitledError as error:
+        _end(error, error.status)
+    except BrokenPipeError:
+        os._exit(1)
+    except Exception as error:
+        traceback.print_exc()
+        _end(error, 1)
+    sys.exit(status or 0)
+
+
+def _end(error: Exception, status: int) -> NoReturn:
+    """One message, and the end of every rank: alike if all know of the error, else by aborting the job."""
+    from mpitled.halo import World
+
+    world = World()
+    if getattr(error, "everywhere", False) or world.size == 1:
+        if world.leads:
+            print(f"mpitled: {error}", file=sys.stderr, flush=True)
+        sys.exit(status)
+    print(f"mpitled: rank {world.rank}: {error}", file=sys.stderr, flush=True)
+    world.abort(status)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="mpitled",
+        description="Brain deformation by tumour growth: coupled FE/EFG and explicit dynamics on MPI ranks.",
+    )
+    parser.add_argument("--version", action="version", version=f"mpitled {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    run = commands.add_parser("run", help="compute a deck; on N ranks: mpirun -n N mpitled run DECK")
+    _deck_arguments(run)
+    run.add_argument("-q", "--quiet", action="store_true", help="no progress and no table")
+    run.set_defaults(command=_run)
+
+    build = commands.add_parser("build", help="build the model of a deck")
+    _deck_arguments(build)
+    build.set_defaults(command=_build)
+
+    part = commands.add_parser("partition", help="partition a model ahead of a job")
+    part.add_argument("model", type=Path, help="model.h5, or the folder that holds it")
+    part.add_argument("parts", type=int, help="number of ranks")
+    part.add_argument("--seed", type=int, default=0, help="METIS's seed (0)")
+    part.set_defaults(command=_partition)
+
+    report = commands.add_parser("report", help="table, report.json and pictures of a run")
+    report.add_argument("directory", type=Path, help="the folder that a run wrote")
+    report.set_defaults(command=_report)
+
+    info = commands.add_parser("info", help="versions of what mpitled works with, and what is missing")
+    info.set_defaults(command=_info)
+    return parser
+
+
+def _deck_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("deck", type=Path, help="the scene, a TOML file")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results (out/NAME OF THE DECK)")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override a key of the deck; repeatable"
+    )
+
+
+def _output(options: argparse.Namespace) -> Path:
+    return options.out or Path("out") / options.deck.stem
+
+
+def _run(options: argparse.Namespace) -> None:
+    from mpitled.deck import load_deck
+    from mpitled.halo import World
+    from mpitled.run import everywhere, run
+
+    world = World()
+    with everywhere():  # each rank reads the same file
+        deck = load_deck(options.deck, options.set)
+    made = run(deck, _output(options), world, quiet=options.quiet)
+    if world.leads and not options.quiet:
+        from mpitled import report
+
+        print(report.table(made))
+        print(f"written to {_output(options)}")
+
+
+def _build(options: argparse.Namespace) -> None:
+    from mpitled.deck import load_deck
+    from mpitled.run import build
+    from mpitled.store import describe_model
+
+    path, built = build(load_deck(options.deck, options.set), _output(options))
+    print(f"{path}: {'built' if built else 'up to date'}")
+    print(describe_model(path))
+
+
+def _partition(options: argparse.Namespace) -> None:
+    from mpitled.run import MODEL, divide
+
+    path = options.model / MODEL if options.model.is_dir() else options.model
+    if options.parts < 2:
+        raise InputError(f"{options.parts} parts: one rank needs no partition; ask for 2 or more")
+    print(divide(path, options.parts, options.seed))
+
+
+def _report(options: argparse.Namespace) -> None:
+    from mpitled import report
+
+    print(report.table(report.write(options.directory)))
+
+
+def _info(options: argparse.Namespace) -> int:
+    from mpitled import info
+
+    print(info.table())
+    return 0 if info.complete() else 1
