@@ -11,9 +11,7 @@ from mpitled.errors import InputError
 from mpitled.material import Material
 
 #: Corners of the reference hexahedron in the Abaqus/VTK order (paper, eq. 4.4).
-CORNERS = np.array(
-    [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]
-)
+CORNERS = np.array([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +20,8 @@ class Constraint:
 
     node_set: str
     directions: tuple[int, ...]  # of 0, 1, 2
-    displacement: tuple[float, ...]  # m at full load, one for each direction; 0 where fixed
+    #: m at full load, one for each direction, 0 where fixed; or (n_nodes,) where the set's nodes move differently
+    displacement: tuple[float | NDArray[np.float64], ...]
     origin: str = ""  # file and line or key, for messages
 
 

@@ -52,13 +52,13 @@ class Phases:
 def build(deck: Deck, directory: Path) -> tuple[Path, bool]:
     """The model of a deck in directory/model.h5, and whether it had to be built: the same deck uses it again."""
     path = directory / MODEL
-    key = decks.model_key(deck)
+    from mpitled import meshes, preprocess  # only the rank that builds needs the meshers
+
+    key = decks.model_key(deck, meshes.files(deck.mesh) if deck.mesh else ())
     if store.model_key(path) == key:
         return path, False
     directory.mkdir(parents=True, exist_ok=True)
-    from mpitled import preprocess  # only the rank that builds needs the meshers
-
-    store.write_model(path, preprocess.build(deck), key)
+    store.write_model(path, preprocess.build(deck), key, decks.canonical(deck))
     return path, True
 
 
