@@ -9,26 +9,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay, cKDTree
 
-from mpitled.cloud import FACES, boundary_faces
-
-if TYPE_CHECKING:
-    from mpitled.report import Outcome
+from mpitled.cloud import FACES, boundary_faces, interface_faces
+from mpitled.model import Model
 
 #: Perceptually uniform and legible to the colour-blind (Nunez et al. 2018; van der Walt and Smith 2015).
-COLOURS = "viridis"
+COLOURS = "magma_r"
 #: A place of the cloud has an integration point this near, in cube roots of that point's volume; a hollow has none.
 _REACH = 1.5
 _INK = "#222222"
+_WALL: dict[str, Any] = {"color": "#0072b2", "linewidth": 1.6}
+_TUMOUR: dict[str, Any] = {"color": "#222222", "linewidth": 1.8}
+_INTERFACE: dict[str, Any] = {"color": "#009e73", "linewidth": 1.2}
 #: Axis that each plane is normal to, and the axes that run right and up in its picture.
 _PLANES = {"sagittal": (0, 1, 2), "coronal": (1, 0, 2), "axial": (2, 0, 1)}
 
@@ -42,18 +43,25 @@ class Solid:
     hexahedra: NDArray[np.int64]  # (m, 8)
     centres: NDArray[np.int64]  # (m,), vertex in the middle of each hexahedron
     cloud: NDArray[np.int64]  # (k, 4), tetrahedra
-    cloud_nodes: NDArray[np.int64]  # EFG nodes
+    interface: NDArray[np.int64]  # (k, 3), triangles between hexahedra and cloud
     walls: dict[str, NDArray[np.int64]]  # ventricle -> triangles (k, 3) around it
     tumour: NDArray[np.int64]  # (k, 3), triangles around it
 
 
-def draw(outcome: Outcome, directory: Path) -> list[str]:
-    """Write undeformed.png and deformed.png; their names."""
-    solid = _solid(outcome)
-    centre = outcome.centre
-    nodes = 1e3 * outcome.model.points
+def draw(
+    directory: Path,
+    model: Model,
+    displacement: NDArray[np.float64],
+    centre: NDArray[np.float64] | None,
+    title: str,
+) -> list[str]:
+    """Write undeformed.png and deformed.png; their names.
+
+    displacement (n_nodes, 3) and the tumour's centre (3,) are in m; without a tumour the cuts go through the middle.
+    """
+    solid = _solid(model, 1e3 * displacement)
+    nodes = 1e3 * model.points
     at = (nodes.min(axis=0) + nodes.max(axis=0)) / 2 if centre is None else 1e3 * centre
-    title = outcome.metadata.get("title") or "mpitled"
     names = []
     for name, share in (("undeformed", 0.0), ("deformed", 1.0)):
         figure = _picture(solid, share, at, f"{title}: {name}")
@@ -65,40 +73,56 @@ def draw(outcome: Outcome, directory: Path) -> list[str]:
 # --- the solid -----------------------------------------------------------------------------------------------------
 
 
-def _solid(outcome: Outcome) -> Solid:
-    model, field = outcome.model, 1e3 * outcome.field
-    field[outcome.seed] = 1e3 * outcome.displacement[outcome.seed]
-    points, n = 1e3 * model.points, model.n_nodes
+def _solid(model: Model, displacement: NDArray[np.float64]) -> Solid:
+    points, n, none = 1e3 * model.points, model.n_nodes, np.empty(0, np.int64)
+    cells = model.hexahedra
     walls = {}
     for name in ("left_ventricle", "right_ventricle"):
-        cells = model.cell_sets.get(name, np.empty(0, np.int64))
-        cells = cells[cells < len(model.hexahedra)]
-        if len(cells):
-            walls[name] = _triangles(boundary_faces(model.hexahedra[cells]))
-    seed = outcome.seed
+        ventricle = model.cell_sets.get(name, none)
+        ventricle = ventricle[ventricle < len(cells)]
+        if len(ventricle):
+            walls[name] = _triangles(boundary_faces(cells[ventricle]))
+    seed, interface = (model.node_sets.get(name, none) for name in ("tumour", "interface"))
     return Solid(
-        points=np.concatenate([points, points[model.hexahedra].mean(axis=1)]),
-        displacement=np.concatenate([field, field[model.hexahedra].mean(axis=1)]),
-        hexahedra=model.hexahedra,
-        centres=np.arange(n, n + len(model.hexahedra)),
-        cloud=_cloud(outcome, points),
-        cloud_nodes=np.arange(model.n_fe_nodes, n),
+        points=np.concatenate([points, points[cells].mean(axis=1)]),
+        displacement=np.concatenate([displacement, displacement[cells].mean(axis=1)]),
+        hexahedra=cells,
+        centres=np.arange(n, n + len(cells)),
+        cloud=_cloud(model, points, seed, interface),
+        interface=_triangles(interface_faces(model.points, cells, interface, model.domain_points)),
         walls=walls,
         tumour=seed[ConvexHull(points[seed]).simplices] if len(seed) else np.empty((0, 3), np.int64),
     )
 
 
-def _cloud(outcome: Outcome, points: NDArray[np.float64]) -> NDArray[np.int64]:
+def _cloud(
+    model: Model, points: NDArray[np.float64], seed: NDArray[np.int64], interface: NDArray[np.int64]
+) -> NDArray[np.int64]:
     """Delaunay tetrahedra (n, 4) of the nodes in support domains, without those in the tumour or where no cloud is."""
-    model = outcome.model
     if len(model.domains) == 0:
         return np.empty((0, 4), np.int64)
-    nodes = np.union1d(np.unique(model.domains), model.node_sets.get("interface", []))
+    nodes = np.union1d(model.domains, interface)
     tetrahedra = nodes[Delaunay(points[nodes]).simplices]
-    in_tumour = np.isin(tetrahedra, outcome.seed).all(axis=1)
-    distance, nearest = cKDTree(1e3 * model.domain_points).query(points[tetrahedra].mean(axis=1))
-    filled = distance < _REACH * 1e3 * np.cbrt(model.domain_volumes[nearest])
-    return tetrahedra[filled & ~in_tumour]
+    centres = points[tetrahedra].mean(axis=1)
+    distance, nearest = cKDTree(1e3 * model.domain_points).query(centres)
+    empty = distance > _REACH * 1e3 * np.cbrt(model.domain_volumes[nearest])
+    empty |= np.isin(tetrahedra, seed).all(axis=1)
+    among_hexahedra = np.flatnonzero((tetrahedra < model.n_fe_nodes).all(axis=1))
+    empty[among_hexahedra] |= _in_hexahedra(centres[among_hexahedra], points, model.hexahedra)
+    return tetrahedra[~empty]
+
+
+def _in_hexahedra(
+    places: NDArray[np.float64], points: NDArray[np.float64], hexahedra: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Which of places (n, 3) lie behind all six faces of one of the hexahedra next to them."""
+    if len(hexahedra) == 0 or len(places) == 0:
+        return np.zeros(len(places), bool)
+    near = cKDTree(points[hexahedra].mean(axis=1)).query(places, k=min(4, len(hexahedra)))[1].reshape(len(places), -1)
+    faces = points[hexahedra[near]][:, :, FACES]  # (n, k, 6, 4, 3)
+    normals = np.cross(faces[..., 2, :] - faces[..., 0, :], faces[..., 3, :] - faces[..., 1, :])
+    heights = ((places[:, None, None] - faces.mean(axis=3)) * normals).sum(axis=-1)
+    return np.asarray((heights <= 0).all(axis=2).any(axis=1))
 
 
 def _triangles(faces: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -155,70 +179,102 @@ def cut_triangles(vertices: Points, height: NDArray[np.float64], triangles: NDAr
 
 
 def _picture(solid: Solid, share: float, at: NDArray[np.float64], title: str) -> Figure:
-    """Three cuts through `at` (3,), mm, with `share` of the displacement, all of one scale."""
+    """Three cuts through `at` (3,), mm, with `share` of the displacement; frames and colours are those of any share."""
     both = np.concatenate([solid.points, solid.points + solid.displacement])
     low, high = both.min(axis=0), both.max(axis=0)
-    margin = 0.04 * (high - low).max()
+    margin = 0.05 * (high - low).max()
     low, high = low - margin, high + margin
     extent = high - low
-    tallest = max(extent[2], extent[1])
     widths = [extent[right] for _, right, _ in _PLANES.values()]
-    scale = 13.0 / sum(widths)
-    figure = Figure(figsize=(15.5, max(scale * tallest + 1.3, 3.0)), layout="constrained")
+    inches = 11.5 / sum(widths)  # a millimetre's
+    figure = Figure(figsize=(15.0, max(inches * max(extent[1], extent[2]) + 1.5, 4.0)), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, 3, width_ratios=widths)
-    largest = float(np.linalg.norm(solid.displacement, axis=1).max())
-    colours = None
+    largest = float(np.linalg.norm(solid.displacement, axis=1).max()) or 1.0
+    levels = _levels(largest)
     for axes, (name, (normal, right, up)) in zip(panels, _PLANES.items(), strict=True):
-        colours = _panel(axes, solid, share, (normal, right, up), float(at[normal]), largest)
-        middle = (low[up] + high[up]) / 2
+        colours = _panel(axes, solid, share, (normal, right, up), float(at[normal]), largest, levels)
         axes.set(
             aspect="equal",
             xlim=(low[right], high[right]),
-            ylim=(middle - tallest / 2, middle + tallest / 2),
+            ylim=(low[up], high[up]),
             xlabel=f"{'xyz'[right]} (mm)",
             ylabel=f"{'xyz'[up]} (mm)",
             title=f"{name + ', ' if solid.walls else ''}{'xyz'[normal]} = {at[normal]:g} mm",
         )
         if right == 0:
             _sides(axes, solid)
-    figure.colorbar(colours, ax=panels, label="displacement (mm)", shrink=0.85, pad=0.01)
+    bar = figure.colorbar(colours, ax=panels, label="displacement (mm)", shrink=0.85, pad=0.01)
+    for level in levels:
+        bar.ax.axhline(level, color=_INK, linewidth=0.8)
+    shown = [Line2D([], [], color=_INK, linewidth=0.8, label=f"{', '.join(f'{level:g}' for level in levels)} mm moved")]
+    for lines, style, label in (
+        (solid.tumour, _TUMOUR, "tumour"),
+        (solid.walls, _WALL, "ventricle"),
+        (solid.interface, _INTERFACE, "end of the support domains"),
+    ):
+        if len(lines):
+            shown.append(Line2D([], [], **style, label=label))
+    figure.legend(handles=shown, loc="outside lower center", ncols=len(shown), frameon=False)
     figure.suptitle(title)
     return figure
 
 
-def _panel(axes: Any, solid: Solid, share: float, plane: tuple[int, int, int], place: float, largest: float) -> Any:
+def _levels(largest: float) -> list[float]:
+    """The four largest of ..., 0.5, 1, 2, 5, 10, ... below `largest`."""
+    decade = int(np.floor(np.log10(largest)))
+    steps = [step * 10.0**k for k in (decade - 2, decade - 1, decade) for step in (1, 2, 5)]
+    return [level for level in steps if level < largest][-4:]
+
+
+def _panel(
+    axes: Any,
+    solid: Solid,
+    share: float,
+    plane: tuple[int, int, int],
+    place: float,
+    largest: float,
+    levels: list[float],
+) -> Any:
     """Draw one cut; what its colours mean."""
     normal, right, up = plane
     places = solid.points + share * solid.displacement
     height = places[:, normal] - place
-    size = np.linalg.norm(solid.displacement, axis=1)
-    vertices = np.column_stack([places[:, right], places[:, up], size])
+    vertices = np.column_stack([places[:, right], places[:, up], np.linalg.norm(solid.displacement, axis=1)])
 
     corners = height[solid.hexahedra]
     crossed = (corners.min(axis=1) < 0) & (corners.max(axis=1) >= 0)
     faces = solid.hexahedra[crossed][:, FACES].reshape(-1, 4)
     triangles = _triangles(faces)
-    centres = np.tile(np.repeat(solid.centres[crossed], 6), 2)
-    fe = cut_tetrahedra(vertices, height, np.column_stack([triangles, centres]))
-    cloud = cut_tetrahedra(vertices, height, solid.cloud)
-    # The cloud first: Delaunay tetrahedra reach a little into hollows of the interface, where hexahedra are.
-    colours = None
-    for order, pieces in enumerate((cloud, fe)):
-        if len(pieces):
-            flat = pieces.reshape(-1, 3)
-            colours = axes.tripcolor(
-                flat[:, 0], flat[:, 1], flat[:, 2], triangles=np.arange(len(flat)).reshape(-1, 3),
-                shading="gouraud", cmap=COLOURS, vmin=0.0, vmax=largest or 1.0, zorder=1 + order,
-            )  # fmt: skip
+    centres = np.tile(np.repeat(solid.centres[crossed], len(FACES)), 2)
+    # The cloud first: its tetrahedra reach a little into hollows of the interface, where hexahedra are.
+    cut = np.concatenate(
+        [
+            cut_tetrahedra(vertices, height, solid.cloud),
+            cut_tetrahedra(vertices, height, np.column_stack([triangles, centres])),
+        ]
+    )
+    flat = cut.reshape(-1, 3)
+    corners_of = np.arange(len(flat)).reshape(-1, 3)
+    colours = axes.tripcolor(
+        flat[:, 0], flat[:, 1], flat[:, 2], triangles=corners_of, shading="gouraud", cmap=COLOURS, vmin=0.0,
+        vmax=largest, zorder=1,
+    )  # fmt: skip
 
     def lines(of: NDArray[np.int64], **style: Any) -> None:
-        axes.add_collection(LineCollection(cut_triangles(vertices, height, of)[:, :, :2], **style))
+        axes.add_collection(LineCollection(list(cut_triangles(vertices, height, of)[:, :, :2]), **style))
 
-    lines(_triangles(np.unique(np.sort(faces, axis=1), axis=0)), colors="white", linewidths=0.25, alpha=0.35, zorder=3)
+    lines(np.unique(np.sort(triangles, axis=1), axis=0), colors=_INK, linewidths=0.3, alpha=0.25, zorder=2)
+    for level in levels:
+        isoline = cut_triangles(flat, flat[:, 2] - level, corners_of)[:, :, :2]
+        axes.add_collection(LineCollection(list(isoline), colors=_INK, linewidths=0.8, zorder=3))
+    lines(solid.interface, **_INTERFACE, zorder=4)
     for wall in solid.walls.values():
-        lines(wall, colors="white", linewidths=1.6, zorder=5)
-    lines(solid.tumour, colors="white", linewidths=1.6, zorder=6)
+        lines(wall, **_WALL, zorder=5)
+    lines(solid.tumour, **_TUMOUR, zorder=6)
+    inside = cut_triangles(vertices, height, solid.tumour)[:, 0, :2]
+    around = inside - inside.mean(axis=0) if len(inside) else inside
+    axes.fill(*inside[np.argsort(np.arctan2(around[:, 1], around[:, 0]))].T, color="0.82", zorder=1)
     return colours
 
 
@@ -227,8 +283,5 @@ def _sides(axes: Any, solid: Solid) -> None:
     if len(solid.walls) < 2:
         return
     left, right = (solid.points[solid.walls[f"{side}_ventricle"], 0].mean() for side in ("left", "right"))
-    for x, letter in ((0.03, "L" if left < right else "R"), (0.97, "R" if left < right else "L")):
-        axes.text(
-            x, 0.97, letter, transform=axes.transAxes, ha="center", va="top", fontsize=14, fontweight="bold",
-            color=_INK, path_effects=[withStroke(linewidth=2, foreground="white")],
-        )  # fmt: skip
+    for x, letter in ((0.04, "L" if left < right else "R"), (0.96, "R" if left < right else "L")):
+        axes.text(x, 0.97, letter, transform=axes.transAxes, ha="center", va="top", fontsize=14, fontweight="bold")

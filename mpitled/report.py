@@ -17,10 +17,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from mpitled import hexahedra, store
-from mpitled.cloud import boundary_faces
+from mpitled.cloud import boundary_faces, interface_faces
 from mpitled.errors import InputError
 from mpitled.model import Model
 
@@ -130,8 +129,8 @@ def compute(outcome: Outcome) -> dict[str, Any]:
         if len(outside):
             report["max_displacement_outside_first_ring_mm"] = 1e3 * float(outside.max())
     report |= _ventricles(outcome, fe_volumes)
-    if outcome.centre is not None:
-        report |= _tumour(outcome)
+    if outcome.centre is not None and len(outcome.seed):
+        report |= _tumour(outcome, outcome.centre)
     return report | outcome.figures
 
 
@@ -147,28 +146,6 @@ def table(report: Mapping[str, Any]) -> str:
 
 
 # --- what is computed ----------------------------------------------------------------------------------------------
-
-
-def interface_faces(model: Model) -> NDArray[np.int64]:
-    """Faces (n, 4) between hexahedra and cloud, anticlockwise seen from the cloud.
-
-    They are faces of one hexahedron alone whose four nodes are of the interface. A face on the outer surface may be
-    such a one too, where the cloud lies all around its hexahedron: but then no cloud lies just beyond it.
-    """
-    interface = np.zeros(model.n_nodes, bool)
-    interface[model.node_sets.get("interface", [])] = True
-    touching = model.hexahedra[interface[model.hexahedra].any(axis=1)]
-    faces = boundary_faces(touching)  # both hexahedra of a face with interface nodes touch the interface
-    faces = faces[interface[faces].all(axis=1)]
-    if len(faces) == 0 or len(model.domains) == 0:
-        return faces[:0]
-    corners = model.points[faces]
-    centres = corners.mean(axis=1)
-    normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-    # A third of a face's size away from it, on its outer side (the normal's length is twice the area).
-    outward = normals / np.linalg.norm(normals, axis=1, keepdims=True) ** 0.5
-    nearest = model.domain_points[cKDTree(model.domain_points).query(centres + outward / 4)[1]]
-    return faces[((nearest - centres) * normals).sum(axis=1) > 0]
 
 
 def enclosed_volume(points: NDArray[np.float64], faces: NDArray[np.int64]) -> float:
@@ -200,7 +177,7 @@ def _outside_first_ring(outcome: Outcome) -> NDArray[np.float64]:
 
 
 def _ventricles(outcome: Outcome, fe_volumes: NDArray[np.float64]) -> dict[str, Any]:
-    """Volumes of the ventricles' hexahedra, undeformed and their change (negative where they shrink), and their walls."""
+    """Volumes of the ventricles' hexahedra, their change (negative: they shrink), and how far their walls moved."""
     model = outcome.model
     before, change, wall = {}, {}, {}
     for side, name in VENTRICLES.items():
@@ -222,13 +199,13 @@ def _ventricles(outcome: Outcome, fe_volumes: NDArray[np.float64]) -> dict[str, 
     }
 
 
-def _tumour(outcome: Outcome) -> dict[str, Any]:
+def _tumour(outcome: Outcome, centre: NDArray[np.float64]) -> dict[str, Any]:
     """Volume of the tumour as reached, by its nodes and by the field there, and where the added volume went.
 
     The volume is that of the sphere of which the nodes are a sample, (4 pi / 3) mean r^3: their hull would be short of
     it by the caps between them. Its integral of r^3 over the solid angle holds for the field's bumpy surface as well.
     """
-    model, seed, centre = outcome.model, outcome.seed, outcome.centre
+    model, seed = outcome.model, outcome.seed
 
     def volume(displacement: NDArray[np.float64]) -> float:
         cubes = np.linalg.norm(model.points[seed] + displacement[seed] - centre, axis=1) ** 3
@@ -239,7 +216,8 @@ def _tumour(outcome: Outcome) -> dict[str, Any]:
         "tumour_volume_mm3": 1e9 * reached,
         "tumour_volume_by_field_mm3": 1e9 * volume(outcome.field),
     }
-    faces = interface_faces(model)
+    interface = model.node_sets.get("interface", np.empty(0, np.int64))
+    faces = interface_faces(model.points, model.hexahedra, interface, model.domain_points)
     if len(faces) and not np.any(outcome.field[_rim(faces)]):
         added = reached - 4 / 3 * math.pi * outcome.metadata["tumour"]["seed_radius_m"] ** 3
         pushed = enclosed_volume(model.points, faces) - enclosed_volume(model.points + outcome.field, faces)
@@ -269,8 +247,11 @@ def _draw(outcome: Outcome, directory: Path) -> list[str] | str:
         return "none, for matplotlib is missing; install it: pip install 'mpitled[pictures]'"
     from mpitled import plot
 
+    moved = outcome.field.copy()
+    moved[outcome.seed] = outcome.displacement[outcome.seed]  # the tumour's surface as prescribed
+    title = outcome.metadata.get("title") or "mpitled"
     try:
-        return plot.draw(outcome, directory)
+        return plot.draw(directory, outcome.model, moved, outcome.centre, title)
     except OSError as error:
         raise InputError(f"{directory}: pictures cannot be written ({error.strerror})") from None
 
