@@ -13,7 +13,9 @@ from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
@@ -26,6 +28,8 @@ from mpitled.model import Model
 COLOURS = "magma_r"
 #: A place of the cloud has an integration point this near, in cube roots of that point's volume; a hollow has none.
 _REACH = 1.5
+#: Cosine of the angle between the normals of a face and of the plane up to which the face's line is drawn.
+_STEEP = 0.8
 _INK = "#222222"
 _WALL: dict[str, Any] = {"color": "#0072b2", "linewidth": 1.6}
 _TUMOUR: dict[str, Any] = {"color": "#222222", "linewidth": 1.8}
@@ -103,26 +107,9 @@ def _cloud(
         return np.empty((0, 4), np.int64)
     nodes = np.union1d(model.domains, interface)
     tetrahedra = nodes[Delaunay(points[nodes]).simplices]
-    centres = points[tetrahedra].mean(axis=1)
-    distance, nearest = cKDTree(1e3 * model.domain_points).query(centres)
-    empty = distance > _REACH * 1e3 * np.cbrt(model.domain_volumes[nearest])
-    empty |= np.isin(tetrahedra, seed).all(axis=1)
-    among_hexahedra = np.flatnonzero((tetrahedra < model.n_fe_nodes).all(axis=1))
-    empty[among_hexahedra] |= _in_hexahedra(centres[among_hexahedra], points, model.hexahedra)
-    return tetrahedra[~empty]
-
-
-def _in_hexahedra(
-    places: NDArray[np.float64], points: NDArray[np.float64], hexahedra: NDArray[np.int64]
-) -> NDArray[np.bool_]:
-    """Which of places (n, 3) lie behind all six faces of one of the hexahedra next to them."""
-    if len(hexahedra) == 0 or len(places) == 0:
-        return np.zeros(len(places), bool)
-    near = cKDTree(points[hexahedra].mean(axis=1)).query(places, k=min(4, len(hexahedra)))[1].reshape(len(places), -1)
-    faces = points[hexahedra[near]][:, :, FACES]  # (n, k, 6, 4, 3)
-    normals = np.cross(faces[..., 2, :] - faces[..., 0, :], faces[..., 3, :] - faces[..., 1, :])
-    heights = ((places[:, None, None] - faces.mean(axis=3)) * normals).sum(axis=-1)
-    return np.asarray((heights <= 0).all(axis=2).any(axis=1))
+    distance, nearest = cKDTree(1e3 * model.domain_points).query(points[tetrahedra].mean(axis=1))
+    filled = distance < _REACH * 1e3 * np.cbrt(model.domain_volumes[nearest])
+    return tetrahedra[filled & ~np.isin(tetrahedra, seed).all(axis=1)]
 
 
 def _triangles(faces: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -191,9 +178,9 @@ def _picture(solid: Solid, share: float, at: NDArray[np.float64], title: str) ->
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, 3, width_ratios=widths)
     largest = float(np.linalg.norm(solid.displacement, axis=1).max()) or 1.0
-    levels = _levels(largest)
+    norm, levels = Normalize(0.0, largest), _levels(largest)
     for axes, (name, (normal, right, up)) in zip(panels, _PLANES.items(), strict=True):
-        colours = _panel(axes, solid, share, (normal, right, up), float(at[normal]), largest, levels)
+        _panel(axes, solid, share, (normal, right, up), float(at[normal]), norm, levels)
         axes.set(
             aspect="equal",
             xlim=(low[right], high[right]),
@@ -204,9 +191,9 @@ def _picture(solid: Solid, share: float, at: NDArray[np.float64], title: str) ->
         )
         if right == 0:
             _sides(axes, solid)
-    bar = figure.colorbar(colours, ax=panels, label="displacement (mm)", shrink=0.85, pad=0.01)
+    bar = figure.colorbar(ScalarMappable(norm, COLOURS), ax=panels, label="displacement (mm)", shrink=0.85, pad=0.01)
     for level in levels:
-        bar.ax.axhline(level, color=_INK, linewidth=0.8)
+        bar.ax.axhline(level, color=_ink_on(norm(level)), linewidth=0.8)
     shown = [Line2D([], [], color=_INK, linewidth=0.8, label=f"{', '.join(f'{level:g}' for level in levels)} mm moved")]
     for lines, style, label in (
         (solid.tumour, _TUMOUR, "tumour"),
@@ -218,6 +205,11 @@ def _picture(solid: Solid, share: float, at: NDArray[np.float64], title: str) ->
     figure.legend(handles=shown, loc="outside lower center", ncols=len(shown), frameon=False)
     figure.suptitle(title)
     return figure
+
+
+def _ink_on(share: float) -> str:
+    """What is seen on the colour of that share of the largest displacement."""
+    return _INK if share < 0.5 else "white"
 
 
 def _levels(largest: float) -> list[float]:
@@ -233,10 +225,10 @@ def _panel(
     share: float,
     plane: tuple[int, int, int],
     place: float,
-    largest: float,
+    norm: Normalize,
     levels: list[float],
-) -> Any:
-    """Draw one cut; what its colours mean."""
+) -> None:
+    """Draw one cut."""
     normal, right, up = plane
     places = solid.points + share * solid.displacement
     height = places[:, normal] - place
@@ -247,35 +239,36 @@ def _panel(
     faces = solid.hexahedra[crossed][:, FACES].reshape(-1, 4)
     triangles = _triangles(faces)
     centres = np.tile(np.repeat(solid.centres[crossed], len(FACES)), 2)
-    # The cloud first: its tetrahedra reach a little into hollows of the interface, where hexahedra are.
-    cut = np.concatenate(
-        [
-            cut_tetrahedra(vertices, height, solid.cloud),
-            cut_tetrahedra(vertices, height, np.column_stack([triangles, centres])),
-        ]
-    )
-    flat = cut.reshape(-1, 3)
-    corners_of = np.arange(len(flat)).reshape(-1, 3)
-    colours = axes.tripcolor(
-        flat[:, 0], flat[:, 1], flat[:, 2], triangles=corners_of, shading="gouraud", cmap=COLOURS, vmin=0.0,
-        vmax=largest, zorder=1,
-    )  # fmt: skip
+    parts = (solid.cloud, np.column_stack([triangles, centres]))
+    # The cloud below: its tetrahedra reach a little into hollows of the interface, where hexahedra are.
+    for order, tetrahedra in zip((1, 3), parts, strict=True):
+        cut = cut_tetrahedra(vertices, height, tetrahedra).reshape(-1, 3)
+        if len(cut) == 0:
+            continue
+        pieces = np.arange(len(cut)).reshape(-1, 3)
+        axes.tripcolor(*cut.T, triangles=pieces, shading="gouraud", cmap=COLOURS, norm=norm, zorder=order)
+        for level in levels:
+            isoline = cut_triangles(cut, cut[:, 2] - level, pieces)[:, :, :2]
+            style = {"colors": _ink_on(norm(level)), "linewidths": 0.8, "zorder": order + 1}
+            axes.add_collection(LineCollection(list(isoline), **style))
 
     def lines(of: NDArray[np.int64], **style: Any) -> None:
         axes.add_collection(LineCollection(list(cut_triangles(vertices, height, of)[:, :, :2]), **style))
 
-    lines(np.unique(np.sort(triangles, axis=1), axis=0), colors=_INK, linewidths=0.3, alpha=0.25, zorder=2)
-    for level in levels:
-        isoline = cut_triangles(flat, flat[:, 2] - level, corners_of)[:, :, :2]
-        axes.add_collection(LineCollection(list(isoline), colors=_INK, linewidths=0.8, zorder=3))
-    lines(solid.interface, **_INTERFACE, zorder=4)
+    # Where a face that lies nearly in the plane crosses it is chance: no line of the mesh.
+    sides = places[triangles[:, 1:]] - places[triangles[:, :1]]
+    normals = np.cross(sides[:, 0], sides[:, 1])
+    steep = triangles[np.abs(normals[:, normal]) < _STEEP * np.linalg.norm(normals, axis=1)]
+    lines(np.unique(np.sort(steep, axis=1), axis=0), colors=_INK, linewidths=0.3, alpha=0.25, zorder=4)
+    lines(solid.interface, **_INTERFACE, zorder=5)
     for wall in solid.walls.values():
-        lines(wall, **_WALL, zorder=5)
-    lines(solid.tumour, **_TUMOUR, zorder=6)
+        lines(wall, **_WALL, zorder=6)
+    lines(solid.tumour, **_TUMOUR, zorder=7)
     inside = cut_triangles(vertices, height, solid.tumour)[:, 0, :2]
-    around = inside - inside.mean(axis=0) if len(inside) else inside
-    axes.fill(*inside[np.argsort(np.arctan2(around[:, 1], around[:, 0]))].T, color="0.82", zorder=1)
-    return colours
+    if len(inside):
+        around = inside - inside.mean(axis=0)
+        outline = inside[np.argsort(np.arctan2(around[:, 1], around[:, 0]))]
+        axes.fill(*outline.T, color="0.82", zorder=2)
 
 
 def _sides(axes: Any, solid: Solid) -> None:
