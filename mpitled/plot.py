@@ -249,8 +249,8 @@ def _panel(
         axes.tripcolor(*cut.T, triangles=pieces, shading="gouraud", cmap=COLOURS, norm=norm, zorder=order)
         for level in levels:
             isoline = cut_triangles(cut, cut[:, 2] - level, pieces)[:, :, :2]
-            style = {"colors": _ink_on(norm(level)), "linewidths": 0.8, "zorder": order + 1}
-            axes.add_collection(LineCollection(list(isoline), **style))
+            ink = _ink_on(norm(level))
+            axes.add_collection(LineCollection(list(isoline), colors=ink, linewidths=0.8, zorder=order + 1))
 
     def lines(of: NDArray[np.int64], **style: Any) -> None:
         axes.add_collection(LineCollection(list(cut_triangles(vertices, height, of)[:, :, :2]), **style))

@@ -139,9 +139,9 @@ def table(report: Mapping[str, Any]) -> str:
     lines = [report["title"]] if report["title"] else []
     if not report["complete"]:
         lines.append(f"not complete: {report['load_share']:.1%} of the load time")
-    lines += [f"  {name:<38}  {value}" for name, value in _rows(report)]
+    lines += [f"  {name:<40}  {value}" for name, value in _rows(report)]
     pictures = report["pictures"]
-    lines.append(f"  {'pictures':<38}  {', '.join(pictures) if isinstance(pictures, list) else pictures}")
+    lines.append(f"  {'pictures':<40}  {', '.join(pictures) if isinstance(pictures, list) else pictures}")
     return "\n".join(lines)
 
 
