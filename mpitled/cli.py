@@ -84,7 +84,8 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("directory", type=Path, help="the folder that a run wrote")
     report.set_defaults(command=_report)
 
-    info = commands.add_parser("info", help="versions of what mpitled works with, and what is missing")
+    info = commands.add_parser("info", help="versions of what mpitled works with, and what is missing; or of a file")
+    info.add_argument("file", type=Path, nargs="?", help="model.h5 or result.vtkhdf: say what it is and holds")
     info.set_defaults(command=_info)
     return parser
 
@@ -165,5 +166,8 @@ def _report(options: argparse.Namespace) -> None:
 def _info(options: argparse.Namespace) -> int:
     from mpitled import info
 
+    if options.file:
+        print(info.describe(options.file))
+        return 0
     print(info.table())
     return 0 if info.complete() else 1
