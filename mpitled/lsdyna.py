@@ -212,7 +212,7 @@ def _included(
                 return folder / name
     except (OSError, ValueError):
         pass
-    keyword.fail(f"names {name}, and there is no such file beside {keyword.path.name}; put it there")
+    keyword.fail(f"names {name}, which is not there; paths are relative to {keyword.path.name}")
 
 
 # --- keywords ------------------------------------------------------------------------------------------------------
@@ -276,7 +276,7 @@ class _Reader:
         elif name.startswith(_GENERATING):
             keyword.fail("is not read; let the preprocessor write out plain nodes and solids")
         elif name.startswith(_LOADS):
-            self.remarks.append(f"warning: {keyword.origin}: *{name} is not applied; only displacements are")
+            self.remarks.append(f"warning: {keyword.origin}: *{name} is not applied, as no load is")
         elif not name.startswith(("KEYWORD", "TITLE", "COMMENT")):
             self.skipped[f"*{name}"] = None
 

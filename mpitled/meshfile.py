@@ -241,13 +241,30 @@ def numbers_at_once(chunk: bytes, dtype: type[Number], comment: bytes) -> tuple[
 
 def _scan(text: bytes, dtype: type[Number]) -> NDArray[Any] | None:
     """Numbers with commas between them; None if anything else is there. As exact as Python's float."""
+    if not _one_in_each_field(text):
+        return None
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)  # numpy before 2.3 only warns of what it cannot read
         try:
             values = np.fromstring(text, np.dtype(dtype), sep=" ,")
         except (ValueError, DeprecationWarning):
             return None
-    return values if len(values) and (dtype is int or np.isfinite(values).all()) else None
+    return values if dtype is int or np.isfinite(values).all() else None
+
+
+def _one_in_each_field(text: bytes) -> bool:
+    """Whether each field between commas holds one word that is more than a sign: numpy reads others as 0 or -1."""
+    characters = np.frombuffer(text, np.uint8)
+    comma = characters == ord(",")
+    solid = ~comma & (characters != ord(" "))
+    first = np.flatnonzero(solid[1:] & ~solid[:-1]) + 1
+    if solid[:1].any():
+        first = np.append(0, first)
+    commas = np.flatnonzero(comma)
+    if len(first) != len(commas) + 1 or (first[1:] < commas).any() or (first[:-1] > commas).any():
+        return False
+    signed = first[(characters[first] == ord("+")) | (characters[first] == ord("-"))]
+    return len(signed) == 0 or bool(signed[-1] + 1 < len(solid) and solid[signed + 1].all())
 
 
 def _separated_line_by_line(
