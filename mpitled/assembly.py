@@ -395,7 +395,8 @@ class Model:
                 alike.setdefault(rows.tobytes(), (rows, {}))[1].setdefault(direction, uniform)
         for rows, by_direction in alike.values():
             name = self.mesh.own_set(rows, f"{keyword.path.name}:{keyword.line}")
-            yield Constraint(name, tuple(by_direction), tuple(by_direction.values()), keyword.origin), rows
+            axes, moves = zip(*sorted(by_direction.items()), strict=True)
+            yield Constraint(name, axes, moves, keyword.origin), rows
 
     def _degrees(self, origin: str, fields: list[str], keyword: Keyword) -> tuple[tuple[int, ...], float]:
         """Directions (0, 1, 2) and displacement of a line of *BOUNDARY; rotations and temperatures are left out."""
@@ -420,7 +421,7 @@ _NOUN = {"node": "node", "cell": "element"}
 def _without_clashes(moved: dict[tuple[int, float], str]) -> list[dict[tuple[int, float], str]]:
     """(direction, displacement) -> origin, all in one unless a direction has two displacements."""
     if len({direction for direction, _ in moved}) == len(moved):
-        return [moved]
+        return [dict(sorted(moved.items()))]
     return [{key: origin} for key, origin in moved.items()]
 
 

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 #: kg/m^3 of a material whose file gives no density.
 DENSITY = 1000.0
+#: Coordinates are smaller, in the file's unit: volumes and their products must stay floats.
+FARTHEST = 1e12
 #: Integration volumes that miss the void's by more than this share are warned about.
 FILLED = 0.01
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
@@ -56,7 +58,14 @@ _MOST_VALUES = 100  # a field of integers with more different values is no divis
 
 def read_file(path: Path) -> MeshFile:
     """What a mesh file of any kind says. InputError if it is none, or wrong."""
-    return _reader(path)[0](path)
+    with np.errstate(over="ignore", invalid="ignore"):  # of what is refused right away
+        file = _reader(path)[0](path)
+    bad = np.flatnonzero(~(np.abs(file.points) < FARTHEST).all(axis=1))
+    if len(bad):
+        raise InputError(
+            f"{path}: node {file.node_ids[bad[0]]} has a coordinate beyond {FARTHEST:g} ({len(bad)} such); correct it"
+        )
+    return file
 
 
 def files(section: deck.MeshFiles) -> list[Path]:
@@ -98,8 +107,6 @@ def _read_with_meshio(path: Path) -> MeshFile:
         raise InputError(f"{path}: cannot be read by meshio ({reason or type(error).__name__}); correct it") from None
     points = np.asarray(mesh.points, float)
     points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
-    if not np.isfinite(points).all():
-        raise InputError(f"{path}: has coordinates that are no finite numbers; correct them")
     file = MeshFile(path, f"meshio ({path.suffix})", points, np.arange(1, len(points) + 1))
     first = 0
     for block in mesh.cells:
@@ -721,7 +728,7 @@ def read_grid(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], dic
         points, volumes, sets, first = _read_csv(path)
     if not len(points):
         raise InputError(f"{path}: has no integration points; give lines of x, y, z, volume")
-    bad = np.flatnonzero(~(volumes > 0) | ~np.isfinite(points).all(axis=1) | ~np.isfinite(volumes))
+    bad = np.flatnonzero(~((volumes > 0) & (volumes < FARTHEST**3) & (np.abs(points) < FARTHEST).all(axis=1)))
     if len(bad):
         where = f"line {first + bad[0]}" if first is not None else f"row {bad[0] + 1}"
         raise InputError(

@@ -185,7 +185,7 @@ def integer(text: str, origin: str) -> int:
     """An integer; InputError if the text is none."""
     if not _INTEGER.fullmatch(text.strip()):
         raise InputError(f"{origin}: {_shown(text)} is not an integer; correct it")
-    return int(text)
+    return int(text.strip())
 
 
 def real(text: str, origin: str) -> float:

@@ -46,10 +46,13 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
     at, volumes, n_hexahedra = mesh.integration_points, mesh.integration_volumes, len(mesh.hexahedra)
     limits, wanted = _limits(deck, mesh)
     found = support.find_domains(mesh.points, at, options.nodes, limits, wanted, options.min_domains)
-    mesh, domains = _without(found.orphans, mesh, found.domains)
+    domains = found.domains
+    repaired = support.repair(mesh.points, at, domains, options.basis, options.weight, limits)
+    # Repairs may take the last domain from a node. FE nodes have their hexahedra.
+    in_domains = np.bincount(domains.ravel(), minlength=mesh.n_nodes) > 0
+    orphans = mesh.n_fe_nodes + np.flatnonzero(~in_domains[mesh.n_fe_nodes :])
+    mesh, domains = _without(orphans, mesh, domains)
     n_fe_nodes, points = mesh.n_fe_nodes, mesh.points
-    limits, _ = _limits(deck, mesh)
-    repaired = support.repair(points, at, domains, options.basis, options.weight, limits)
     shapes, gradients, condition = support.moving_least_squares(points[domains], at, options.basis, options.weight)
     field_domains, field_shapes = support.field_at_nodes(points, n_fe_nodes, at, domains, options.basis, options.weight)
     dofs, displacements = prescribe(deck, mesh)
@@ -84,7 +87,7 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
         "volume_m3": float(fe_volumes.sum() + volumes.sum()),
         "domains_limited": found.limited,
         "memberships_added": found.added,
-        "orphans_removed": len(found.orphans),
+        "orphans_removed": len(orphans),
         "domains_repaired": repaired,
         "worst_condition": float(condition.max()) if len(condition) else 1.0,
     }
