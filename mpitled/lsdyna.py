@@ -372,7 +372,7 @@ class _Reader:
     def _set(self, keyword: _Keyword) -> None:
         name, options = keyword.without("TITLE", "COLLECT")
         kind = {"NODE": "node", "SOLI": "cell", "PART": "part"}[name[4:8]]
-        option = name.split("_", 2)[2] if name.count("_") > 1 else "LIST"
+        option = name.split("_", 2)[2].removeprefix("LIST_") if name.count("_") > 1 else "LIST"
         lines = keyword.lines()
         title = lines.pop(0)[1].strip() if "TITLE" in options and lines else ""
         if not lines:
@@ -393,7 +393,7 @@ class _Reader:
                     self._range(card, chosen, first, last, 1)
             elif option == "GENERATE_INCREMENT":
                 self._range(card, chosen, *[*values, 0, 0, 1][:3])
-            elif option in ("LIST", "COLUMN", "LIST_SMOOTH"):
+            elif option in ("LIST", "COLUMN", "SMOOTH"):
                 chosen.labels.append(_labels(values, card))
             elif option == "ADD":
                 chosen.sets += [value for value in values if value]
