@@ -138,7 +138,9 @@ def _meshio_sets(mesh: Any, file: MeshFile) -> None:
             own = [start + np.asarray(b, np.int64) for start, b in zip(ends, blocks, strict=False) if b is not None]
             meshfile.add_set(file.cell_sets, name, np.unique(np.concatenate([np.empty(0, np.int64), *own])))
     groups = {int(tag): name for name, (tag, _) in getattr(mesh, "field_data", {}).items()}
-    cell_fields = {name: np.concatenate([np.ravel(part) for part in parts]) for name, parts in mesh.cell_data.items()}
+    cell_fields = {
+        name: np.concatenate([np.empty(0, np.int64), *map(np.ravel, parts)]) for name, parts in mesh.cell_data.items()
+    }
     for fields, families, sets, size in (
         (mesh.point_data, getattr(mesh, "point_tags", {}), file.node_sets, len(file.points)),
         (cell_fields, getattr(mesh, "cell_tags", {}), file.cell_sets, file.n_cells),
