@@ -179,11 +179,16 @@ class Displaced:
 class Solver:
     """Explicit time integration."""
 
-    method: Literal["quasi-static"] = key("slow loading, with mass scaling where the step needs it", "quasi-static")
-    load_time: float = key("duration of the load", 2.0, "s", "(0, inf)")
+    method: Literal["quasi-static", "dynamic-relaxation", "dynamic"] = key(
+        "slow loading; damped steps to the static solution; or waves, with the true masses", "quasi-static"
+    )
+    load_time: float = key("quasi-static, dynamic: duration of the load", 2.0, "s", "(0, inf)")
+    hold_time: float = key("quasi-static, dynamic: duration after it, at full load", 0.0, "s", "[0, inf)")
+    load_steps: int = key("dynamic-relaxation: steps in which the load grows", 500, limits="[1, inf)")
+    tolerance: float = key("dynamic-relaxation ends this near to the static solution", 0.01, "mm", "(0, inf)")
     time_step: Literal["auto"] | float = key("time step; auto: from the stability bound", "auto", "s", "(0, inf)")
     safety: float = key("share of the stability bound that the step takes", 0.8, limits="(0, 1]")
-    mass_scaling: bool = key("raise the mass of cells that the step is too long for", True)
+    mass_scaling: bool = key("quasi-static: raise the mass of nodes that the step is too long for", True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -71,9 +71,12 @@ def build(deck: Deck) -> Model:
     each = np.concatenate([8 * stiffness[:n_hexahedra], options.nodes * stiffness[n_hexahedra:]])
     critical = 2 * np.sqrt(mass / _shared(mesh.hexahedra, domains, each, len(points)))
     loose = np.setdiff1d(np.arange(len(points)), dofs // 3)
+    critical = critical[loose] if len(loose) else critical
+    # Next to a seed the cloud is fine: a few heavier nodes there cost less than its short step everywhere.
+    in_cloud = np.isin(loose, domains) if len(loose) else np.zeros(len(points), bool)
     figures |= {
-        "critical_step_min_s": float(critical[loose].min()) if len(loose) else float(critical.min()),
-        "critical_step_median_s": float(np.median(critical[loose])) if len(loose) else float(critical.min()),
+        "critical_step_min_s": float(critical.min()),
+        "critical_step_typical_s": float(np.median(critical if in_cloud.all() else critical[~in_cloud])),
         "mass_kg": float(cell_mass.sum()),
         "volume_m3": float(fe_volumes.sum() + volumes.sum()),
         "domains_limited": found.limited,
