@@ -11,6 +11,7 @@ import sys
 import typing
 
 import pytest
+from conftest import ROOT
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -419,6 +420,11 @@ def test_a_canonical_deck_reads_as_the_same_deck(
         assert reread == deck
         assert canonical(reread) == written
         assert model_key(reread) == model_key(deck)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "jobs").rglob("*.toml")), ids=lambda path: path.stem)
+def test_shipped_decks_load(path):
+    assert load_deck(path).title
 
 
 # ------------------------------------------------------------ the model's key

@@ -369,6 +369,13 @@ def test_patch_of_the_mixed_mesh(tmp_path, support, cloud):
     assert residual(model_of(tmp_path, f"{support}\nconsistency = false", cloud)) > 1e-2
 
 
+def test_a_cloud_without_a_node_is_refused(tmp_path):
+    path = tmp_path / "block.toml"
+    path.write_text(BLOCK.replace("[8, 7, 6]", "[3, 3, 3]").format(cloud="core", support=""))
+    with pytest.raises(InputError, match=r"cloud: no node fits into .* lower cloud\.spacing"):
+        build(load_deck(path))
+
+
 def test_orphans_are_removed_from_the_model_and_counted(tmp_path):
     text = BLOCK.replace("[8, 7, 6]", "[2, 2, 1]").format(cloud="all", support="nodes = 4\nmin_domains = 1")
     path = tmp_path / "block.toml"
