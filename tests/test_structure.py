@@ -106,7 +106,7 @@ nodes = "x0"
 nodes = "x1"
 displacement = [0.1, 0.0, 0.0]
 [solver]
-load_time = 0.2
+load_time = 1.0
 [output]
 frames = 1
 """
