@@ -96,7 +96,7 @@ def fill_void(
     EFG nodes; so a cloud without hexahedra ends on the given surface. `element_size` (m) is the largest spacing
     unless the deck gives one. The same arguments give the same bits.
 
-    Raises InputError if nothing is dropped or if the seed does not lie inside the void.
+    Raises InputError if nothing is dropped, if no node fits in, or if the seed does not lie inside the void.
     """
     if not dropped.any():
         raise InputError("cloud: no hexahedron is replaced by it; enlarge cloud.radius or block.core_share")
@@ -126,6 +126,10 @@ def fill_void(
         figures["integration_volume_before_rescaling_m3"] = sampled
 
     n_efg = np.count_nonzero(on_boundary & ~in_fe) + len(seed) + len(inner)
+    if n_efg == 0:
+        raise InputError(
+            "cloud: no node fits into the hexahedra that it replaces; replace more, or lower cloud.spacing"
+        )
     figures["integration_points_per_efg_node"] = float(len(volumes) / n_efg)
     return Filling(
         points=np.concatenate([points[kept], seed, inner]),

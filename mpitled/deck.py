@@ -261,8 +261,10 @@ class _Source(NamedTuple):
     overridden: frozenset[str]
 
     def error(self, name: str, what: str, value: Any = MISSING) -> InputError:
-        where = "--set" if name in self.overridden else self.path
-        return InputError(f"{where}: {name}{'' if value is MISSING else f' = {_show(value)}'}: {what}")
+        # An override of a part, or of the section around it, is to blame too.
+        overridden = any(f"{name}.".startswith(f"{o}.") or o.startswith(f"{name}.") for o in self.overridden)
+        shown = "" if value is MISSING else f" = {_show(value)}"
+        return InputError(_line(f"{'--set' if overridden else self.path}: {name}{shown}: {what}"))
 
 
 def _parse(path: Path) -> dict[str, Any]:
@@ -286,13 +288,14 @@ def _syntax(text: str, error: Exception) -> str:
     message, line = str(error), re.search(r"line (\d+)", str(error))
     if not line:
         return f"{message}; correct the TOML"
-    shown = _shorten(text.splitlines()[int(line[1]) - 1].strip())
+    shown = _shorten(_line(text.split("\n")[int(line[1]) - 1].strip()))
     return f"line {line[1]}: {message[: line.start()].rstrip(' (at')}: {shown}; correct the TOML"
 
 
 def _override(table: dict[str, Any], text: str) -> str:
     """Enter "section.key=value" into the table of the deck; the key's name."""
     name, equals, value = (part.strip() for part in text.partition("="))
+    text = _line(text)
     steps = name.split(".")
     if not equals or not all(steps):
         raise InputError(f"--set {text}: is not section.key=value; write for example --set tumour.volume=523.6")
@@ -509,6 +512,11 @@ def _show(value: Any) -> str:
     if isinstance(value, dict):
         return _shorten(f"{{{', '.join(f'{k} = {_show(v)}' for k, v in value.items())}}}")
     return f"{value:.10g}" if isinstance(value, float) else _shorten(str(value))
+
+
+def _line(text: str) -> str:
+    """Names and overrides can hold line breaks, messages must not."""
+    return " ".join(text.splitlines())
 
 
 def _shorten(text: str) -> str:

@@ -129,7 +129,7 @@ def aspect(points: NDArray[np.float64], hexahedra: NDArray[np.integer]) -> NDArr
     for chunk in _chunks(len(hexahedra)):
         lengths = _edge_lengths(points[hexahedra[chunk]])
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio[chunk] = np.nan_to_num(lengths.max(axis=1) / lengths.min(axis=1), nan=np.inf)
+            ratio[chunk] = np.nan_to_num(lengths.max(axis=1) / lengths.min(axis=1), nan=np.inf, posinf=np.inf)
     return ratio
 
 

@@ -11,9 +11,7 @@ from mpitled.errors import InputError
 from mpitled.material import Material
 
 #: Corners of the reference hexahedron in the Abaqus/VTK order (paper, eq. 4.4).
-CORNERS = np.array(
-    [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]
-)
+CORNERS = np.array([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
 
 
 @dataclass(frozen=True, slots=True)

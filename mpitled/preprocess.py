@@ -40,10 +40,11 @@ def build(deck: Deck) -> Model:
     at, volumes, n_hexahedra = mesh.integration_points, mesh.integration_volumes, len(mesh.hexahedra)
     limits, wanted = _limits(deck, mesh)
     found = support.find_domains(mesh.points, at, options.nodes, limits, wanted, options.min_domains)
-    mesh, domains = _without(found.orphans, mesh, found.domains)
+    repaired = support.repair(mesh.points, at, found.domains, options.basis, options.weight, limits)
+    # Only now: repair can take a node from its last domain. FE nodes stay, for they have mass from hexahedra.
+    orphans = np.setdiff1d(np.arange(mesh.n_fe_nodes, mesh.n_nodes), found.domains)
+    mesh, domains = _without(orphans, mesh, found.domains)
     n_fe_nodes, points = mesh.n_fe_nodes, mesh.points
-    limits, _ = _limits(deck, mesh)
-    repaired = support.repair(points, at, domains, options.basis, options.weight, limits)
     shapes, gradients, condition = support.moving_least_squares(points[domains], at, options.basis, options.weight)
     field_domains, field_shapes = support.field_at_nodes(points, n_fe_nodes, at, domains, options.basis, options.weight)
     dofs, displacements = prescribe(deck, mesh)
@@ -81,7 +82,7 @@ def build(deck: Deck) -> Model:
         "volume_m3": float(fe_volumes.sum() + volumes.sum()),
         "domains_limited": found.limited,
         "memberships_added": found.added,
-        "orphans_removed": len(found.orphans),
+        "orphans_removed": len(orphans),
         "domains_repaired": repaired,
         "worst_condition": float(condition.max()) if len(condition) else 1.0,
     }

@@ -54,6 +54,7 @@ _MODEL_ARRAYS = {
 
 
 def hdf5_version() -> str:
+    """Version of the HDF5 library that h5py was built on."""
     return str(h5py.version.hdf5_version)
 
 

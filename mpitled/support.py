@@ -35,7 +35,6 @@ class Found:
     domains: NDArray[np.int64]  # (n_domains, n)
     limited: int  # domains that hold others than their nearest nodes because of a limit
     added: int  # nodes put into domains so that each wanted node is in enough of them
-    orphans: NDArray[np.int64]  # wanted nodes in no domain, ascending
 
 
 def find_domains(
@@ -86,7 +85,7 @@ def find_domains(
         masks = np.array([mask for mask, _ in limits]).reshape(len(limits), len(points))
         ceilings = np.array([limit for _, limit in limits], np.int64)
         added = _widen(domains, counts, points, at, poor, near, wanted, masks, ceilings, min_domains)
-    return Found(domains, limited, added, np.flatnonzero(wanted & (counts == 0)))
+    return Found(domains, limited, added)
 
 
 def _nearest(tree: cKDTree, at: NDArray[np.float64], k: int) -> NDArray[np.int64]:
