@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mpitled.mesh import Rotation
+
 
 def loading_curve(share: float) -> float:
     """Share of the full load at the share t/T of the load time (paper, eq. 4.1): rest at both ends."""
@@ -22,3 +24,12 @@ def growth(
 ) -> NDArray[np.float64]:
     """Displacement (n, 3), m at full load, of nodes on the seed's surface: radially, to the sphere of that volume."""
     return (sphere_radius(volume) / seed_radius - 1) * (points - centre)
+
+
+def turn(points: NDArray[np.float64], rotation: Rotation, share: float = 1.0) -> NDArray[np.float64]:
+    """Displacement (n, 3), m, of points (n, 3) turned by that share of the rotation's angle."""
+    arm = points - np.asarray(rotation.centre)
+    arm[:, rotation.axis] = 0.0
+    axis = np.eye(3)[rotation.axis]
+    angle = share * rotation.angle
+    return (np.cos(angle) - 1) * arm + np.sin(angle) * np.cross(axis, arm)

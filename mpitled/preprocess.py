@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import block, hexahedra, labels, support
+from mpitled import block, hexahedra, labels, phantoms, support
 from mpitled.deck import Deck
 from mpitled.errors import InputError
-from mpitled.loading import growth
+from mpitled.loading import growth, turn
 from mpitled.material import Material
 from mpitled.mesh import Mesh, named_set
 from mpitled.model import Model
@@ -27,7 +27,11 @@ def read_mesh(deck: Deck) -> Mesh:
         return labels.mesh_labels(deck.labels, deck.cloud, deck.tumour)
     if deck.block:
         return block.block_mesh(deck.block, deck.cloud, deck.tumour)
-    assert deck.mesh is not None  # load_deck sees to one of the three
+    if deck.cylinder:
+        return phantoms.cylinder_mesh(deck.cylinder, deck.cloud, deck.tumour)
+    if deck.ellipsoid:
+        return phantoms.ellipsoid_mesh(deck.ellipsoid, deck.cloud, deck.tumour)
+    assert deck.mesh is not None  # load_deck sees to exactly one geometry
     from mpitled import reader
 
     return reader.read_mesh(deck.mesh)
@@ -187,9 +191,10 @@ def prescribe(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.flo
     dofs, values, origins = [], [], []
     for constraint in (*deck.constraints(), *mesh.constraints):
         nodes = named_set(mesh.node_sets, constraint.node_set, constraint.origin)
+        turned = turn(mesh.points[nodes], constraint.rotation) if constraint.rotation else np.zeros((len(nodes), 3))
         for direction, displacement in zip(constraint.directions, constraint.displacement, strict=True):
             dofs.append(3 * nodes + direction)
-            values.append(np.full(len(nodes), displacement))
+            values.append(displacement + turned[:, direction])
             origins.append(constraint.origin)
     if deck.tumour:
         origin = f"{deck.path}: tumour"

@@ -741,6 +741,12 @@ def _ascending(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
     return rows[np.argsort(numbers[rows])]
 
 
+def is_result(path: Path) -> bool:
+    """Whether the HDF5 file is a result of ours, of whatever layout; InputError if it is no HDF5 file."""
+    with _open(path) as file:
+        return "mpitled" in file and "VTKHDF" in file
+
+
 def open_result(path: Path) -> Result:
     """Results in a file, or in a directory: there the unfinished ones, which are later than any finished, if any.
 
