@@ -82,7 +82,7 @@ class Field:
         )  # t = -1, t = 1, s = -1, r = 1, s = 1, r = -1
         r, s, t = xi.T
         beyond = np.stack([t < -1, t > 1, s < -1, r > 1, s > 1, r < -1], axis=1)
-        return (faces & beyond).any(axis=1)
+        return np.logical_and(faces, beyond).any(axis=1)
 
 
 def open_field(path: Path, frame: int = -1) -> Field:
@@ -192,8 +192,9 @@ def _shapes(xi: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def prescribed(model: Model) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Nodes (n_nodes,) that are prescribed in all three directions, and those of them that move."""
-    every = np.bincount(model.prescribed_dofs // 3, minlength=model.n_nodes) == 3
-    moves = np.bincount(model.prescribed_dofs // 3, model.prescribed_displacements != 0, model.n_nodes) > 0
+    nodes = model.prescribed_dofs // 3
+    every = np.bincount(nodes, minlength=model.n_nodes) == 3
+    moves = np.bincount(nodes, (model.prescribed_displacements != 0) | model.prescribed_turns.any(1), model.n_nodes) > 0
     return every, every & moves
 
 

@@ -26,10 +26,14 @@ def growth(
     return (sphere_radius(volume) / seed_radius - 1) * (points - centre)
 
 
-def turn(points: NDArray[np.float64], rotation: Rotation, share: float = 1.0) -> NDArray[np.float64]:
-    """Displacement (n, 3), m, of points (n, 3) turned by that share of the rotation's angle."""
+def turn(points: NDArray[np.float64], rotation: Rotation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Displacements (n, 3), m at full load, of points (n, 3) that are turned, and (n, 3, 3) how they get there.
+
+    The last axis of the latter is, for each direction, the angle phi in rad, the arm r from the axis and e x r, both in
+    m: at the share d of the load the displacement is (cos(d phi) - 1) r + sin(d phi) e x r.
+    """
     arm = points - np.asarray(rotation.centre)
     arm[:, rotation.axis] = 0.0
-    axis = np.eye(3)[rotation.axis]
-    angle = share * rotation.angle
-    return (np.cos(angle) - 1) * arm + np.sin(angle) * np.cross(axis, arm)
+    across = np.cross(np.eye(3)[rotation.axis], arm)
+    turns = np.stack([np.full_like(arm, rotation.angle), arm, across], axis=2)
+    return (np.cos(rotation.angle) - 1) * arm + np.sin(rotation.angle) * across, turns

@@ -78,23 +78,44 @@ def compose(sub: Subdomain, halo: Halo | None) -> tuple[Term, ...]:
     if halo is not None:
         terms.append(("halo", lambda s: halo.sum(s.f)))
     owned = sub.rows.owned[sub.moving // 3]
-    dofs, full = sub.moving[owned], sub.moving_full[owned]
+    full, turns = sub.moving_full, sub.moving_turns
+    dofs, own_full, share = sub.moving[owned], full[owned], _share_of_load
+    if turns is not None:
+        ends, own_ends, own_turns = full, own_full, turns[owned]
+        full, own_full, share = full.copy(), own_full.copy(), _all
+
+        def motion(s: State) -> None:
+            target = _share_of_load(s)
+            kernels.follow(full, ends, turns, target)
+            kernels.follow(own_full, own_ends, own_turns, target)
+
+        terms.append(("motion", motion))
     if len(dofs):
 
         def reactions(s: State) -> None:
-            target = loading_curve((s.step + 1) / s.n_steps)
-            s.external_work += kernels.react(s.u, s.u_prev, s.f, s.mass, dofs, full, target, s.reaction, s.time_step)
+            s.external_work += kernels.react(
+                s.u, s.u_prev, s.f, s.mass, dofs, own_full, share(s), s.reaction, s.time_step
+            )
 
         terms.append(("reactions", reactions))
 
     def update(s: State) -> None:
-        target = loading_curve((s.step + 1) / s.n_steps)
-        kernels.update(s.u, s.u_prev, s.f, s.mobility, sub.fixed, sub.moving, sub.moving_full, target)
+        kernels.update(s.u, s.u_prev, s.f, s.mobility, sub.fixed, sub.moving, full, share(s))
         s.u, s.u_prev = s.u_prev, s.u
         s.step += 1
 
     terms.append(("update", update))
     return tuple(terms)
+
+
+def _share_of_load(s: State) -> float:
+    """Share of the full load at the end of the step."""
+    return loading_curve((s.step + 1) / s.n_steps)
+
+
+def _all(s: State) -> float:
+    """Where `motion` has the displacements of the present step."""
+    return 1.0
 
 
 @dataclass(slots=True)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from partition import PartTables
 
 #: Written into every model; a file of another layout is built anew, never read by guess.
-MODEL_LAYOUT = 1
+MODEL_LAYOUT = 2
 
 #: A file of results of another layout is refused too.
 RESULT_LAYOUT = 1
@@ -50,6 +50,7 @@ _MODEL_ARRAYS = {
     "mass": np.float64,
     "prescribed_dofs": np.int64,
     "prescribed_displacements": np.float64,
+    "prescribed_turns": np.float64,
 }
 
 
@@ -286,6 +287,7 @@ class PartRows:
     materials: tuple[Material, ...]
     prescribed_dofs: NDArray[np.int64]  # ascending 3 node + direction, on `nodes`
     prescribed_displacements: NDArray[np.float64]  # m
+    prescribed_turns: NDArray[np.float64]  # (len(prescribed_dofs), 3)
     field_nodes: NDArray[np.int64]  # ascending EFG nodes whose field one of `domains` gives; not all in `nodes`
     field_domains: NDArray[np.int64]  # the support domain of each, a number of the whole model
     field_shapes: NDArray[np.float64]  # (len(field_nodes), n)
@@ -348,6 +350,7 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
             materials=_read_materials(file),
             prescribed_dofs=dofs,
             prescribed_displacements=read_rows(file["prescribed_displacements"], prescribed),
+            prescribed_turns=read_rows(file["prescribed_turns"], prescribed),
             field_nodes=n_fe_nodes + fields_here,
             field_domains=field_domains,
             field_shapes=read_rows(file["field_shapes"], fields_here),
