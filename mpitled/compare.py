@@ -120,7 +120,7 @@ def edge_distance(model: Model, places: NDArray[np.float64]) -> NDArray[np.float
     """Distances (n,), m, of places (n, 3) from edges between prescribed and free surface; infinite without any.
 
     On hexahedra these are the faces' edges between faces whose nodes are all prescribed in all directions and others.
-    On a surface of EFG nodes they are prescribed nodes with a free one among their nearest on it.
+    On a surface of EFG nodes, which has no faces, they are prescribed nodes with a free one among their three nearest.
     """
     held, _ = field.prescribed(model)
     faces = field.outer_faces(model)
@@ -135,7 +135,7 @@ def edge_distance(model: Model, places: NDArray[np.float64]) -> NDArray[np.float
     outer = np.unique(np.concatenate([np.empty(0, np.int64), *(model.node_sets.get(name, []) for name in OUTER)]))
     outer = outer[outer >= model.n_fe_nodes].astype(np.int64)
     if len(outer):
-        near = cKDTree(model.points[outer]).query(model.points[outer], min(9, len(outer)))[1].reshape(len(outer), -1)
+        near = cKDTree(model.points[outer]).query(model.points[outer], min(4, len(outer)))[1].reshape(len(outer), -1)
         last = outer[held[outer] & ~held[outer[near]].all(axis=1)]
         on_edges = np.concatenate([on_edges, model.points[last]])
     return np.asarray(cKDTree(on_edges).query(places)[0]) if len(on_edges) else np.full(len(places), np.inf)

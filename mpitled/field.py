@@ -128,7 +128,8 @@ def locate(
     tree = cKDTree(points[hexahedra].mean(axis=1))
     missed = np.arange(n)
     for k in _CANDIDATES:
-        for rows in np.array_split(missed, len(missed) // _CHUNK + 1):
+        for first in range(0, len(missed), _CHUNK):
+            rows = missed[first : first + _CHUNK]
             near = tree.query(places[rows], min(k, len(hexahedra)))[1].reshape(len(rows), -1)
             cells[rows], xi[rows], distance[rows] = _best(points, hexahedra, near, places[rows])
         missed = np.flatnonzero(distance > 0)

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 _CORE, _BULGE = 0.5, 0.4
 # Elements over the core's width for each element's size in the radius, so that the mean edge is the size asked for.
 _ACROSS = 1.1
+# Thickness over width of the shells around a seed.
+_THICK = 1.5
 
 
 def cylinder_mesh(cylinder: deck.Cylinder, cloud: deck.Cloud, tumour: deck.Tumour | None) -> Mesh:
@@ -74,7 +76,7 @@ def ellipsoid_mesh(ellipsoid: deck.Ellipsoid, cloud: deck.Cloud, tumour: deck.Tu
     _check_room(tumour, axes, size)
     if ellipsoid.cavity == "moved":
         return _moved(points, onion.cells, node_sets, axes, np.asarray(tumour.centre))
-    return _fitted(points[onion.surface], onion, node_sets, cloud, tumour, size)
+    return _fitted(points[onion.surface], onion, node_sets, tumour, size)
 
 
 class _Onion:
@@ -193,16 +195,17 @@ def _fitted(
     outer: NDArray[np.float64],
     onion: _Onion,
     node_sets: dict[str, NDArray[np.int64]],
-    cloud: deck.Cloud,
     tumour: deck.Tumour,
     element_size: float,
 ) -> Mesh:
     """Shells from the seed's surface, set tumour, to the ellipsoid's nodes `outer` (n, 3).
 
-    Shells are as thick as a cloud's spacing there: `cloud.growth` of the distance to the centre, at most an element's
-    size. Lines leave the seed at right angles and turn evenly towards their place on the surface.
+    Shells are _THICK times as thick as cells are wide, which widen with the distance to the centre, but at most an
+    element's size: growth makes them thin and wide. Lines leave the seed at right angles and turn evenly towards their
+    place on the surface.
     """
-    centre, seed, growth = np.asarray(tumour.centre), tumour.seed_radius, cloud.growth
+    centre, seed = np.asarray(tumour.centre), tumour.seed_radius
+    growth = _THICK * np.sqrt(4 * np.pi / len(onion.faces))
     reach = np.linalg.norm(outer - centre, axis=1)
     even = max(element_size / growth, seed)  # from this distance on shells are equally thick
     ends = np.log(np.minimum(reach, even) / seed) / growth + np.maximum(reach - even, 0) / (growth * even)
