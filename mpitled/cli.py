@@ -83,7 +83,8 @@ def _parser() -> argparse.ArgumentParser:
     compare.add_argument("--json", action="store_true", help="JSON instead of a table")
     compare.set_defaults(command=_compare)
 
-    info = commands.add_parser("info", help="versions of what mpitled works with, and what is missing")
+    info = commands.add_parser("info", help="versions of what mpitled works with, and what is missing; or of a file")
+    info.add_argument("file", type=Path, nargs="?", help="model.h5 or result.vtkhdf: say what it is and holds")
     info.set_defaults(command=_info)
     return parser
 
@@ -151,5 +152,8 @@ def _compare(options: argparse.Namespace) -> None:
 def _info(options: argparse.Namespace) -> int:
     from mpitled import info
 
+    if options.file:
+        print(info.describe(options.file))
+        return 0
     print(info.table())
     return 0 if info.complete() else 1

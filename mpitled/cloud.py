@@ -173,6 +173,33 @@ def boundary_faces(hexahedra: NDArray[np.int64]) -> NDArray[np.int64]:
     return faces[np.sort(first[count == 1])]
 
 
+def interface_faces(
+    points: NDArray[np.float64],
+    hexahedra: NDArray[np.int64],
+    interface: NDArray[np.int64],
+    integration_points: NDArray[np.float64],
+) -> NDArray[np.int64]:
+    """Faces (n, 4) between hexahedra and cloud, anticlockwise seen from the cloud.
+
+    They are faces of one hexahedron alone whose four nodes are of the interface. A face on the outer surface may be
+    such a one too, where the cloud lies all around its hexahedron: but then no cloud lies just beyond it.
+    """
+    of_interface = np.zeros(len(points), bool)
+    of_interface[interface] = True
+    # Both hexahedra of a face with interface nodes are among these.
+    faces = boundary_faces(hexahedra[of_interface[hexahedra].any(axis=1)])
+    faces = faces[of_interface[faces].all(axis=1)]
+    if len(faces) == 0 or len(integration_points) == 0:
+        return faces[:0]
+    corners = points[faces]
+    centres = corners.mean(axis=1)
+    normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    # A third of a face's size beyond it (the normal's length is twice the area).
+    beyond = centres + normals / np.linalg.norm(normals, axis=1, keepdims=True) ** 0.5 / 4
+    nearest = integration_points[cKDTree(integration_points).query(beyond)[1]]
+    return faces[((nearest - centres) * normals).sum(axis=1) > 0]
+
+
 def on_sphere(n: int) -> NDArray[np.float64]:
     """Unit vectors (n, 3) of the Fibonacci lattice, whose points have equal areas (Gonzalez 2010)."""
     i = np.arange(n) + 0.5

@@ -17,6 +17,16 @@ from mpitled import kernels
 _SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS" if "PMIX_RANK" in os.environ else "PMI_SIZE")
 
 
+def library_version() -> str:
+    """Name and version of the MPI library, which is not started. ImportError or RuntimeError if there is none."""
+    import mpi4py
+
+    mpi4py.rc.initialize = False
+    from mpi4py import MPI
+
+    return " ".join(MPI.Get_library_version().replace(",", " ").replace("\0", " ").split()[:3])
+
+
 class World:
     """All ranks of the job. Every method is collective: reached by every rank or by none."""
 

@@ -54,6 +54,15 @@ _MODEL_ARRAYS = {
 }
 
 
+def hdf5_version() -> str:
+    return str(h5py.version.hdf5_version)
+
+
+def has_mpi() -> bool:
+    """Whether several ranks can write one file."""
+    return bool(h5py.get_config().mpi)
+
+
 # --- the model ---------------------------------------------------------------------------------------------------
 
 
@@ -442,7 +451,7 @@ class ResultWriter:
         """
         if comm is not None and comm.size == 1:
             comm = None
-        if comm is not None and not h5py.get_config().mpi:
+        if comm is not None and not has_mpi():
             raise InputError("h5py: is built without MPI; build it against parallel HDF5, or run on one rank")
         self._comm, self._part, self._n_frames, self._frame = comm, part, n_frames, 0
         self._announced = {*point_data, *cell_data, *series}

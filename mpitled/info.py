@@ -1,0 +1,129 @@
+"""What mpitled works with: versions, what is missing and how to get it; and what a file of its own holds."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from mpitled import __version__
+from mpitled.errors import InputError
+
+_SETUP = "bash jobs/brain.sh sets it up, or see jobs/environment.sh"
+
+
+class _Part(NamedTuple):
+    """Something that is needed, or only useful."""
+
+    name: str
+    version: str | None  # None where it is missing
+    purpose: str
+    remedy: str
+    needed: bool = True
+
+
+def table() -> str:
+    """Versions, a line each, then what is missing, what it is for and how to get it."""
+    parts = _parts()
+    lines = [f"{part.name:<12}{part.version or 'missing'}" for part in parts]
+    for part in parts:
+        if part.version is None:
+            need = "needed" if part.needed else "useful"
+            lines.append(f"{part.name} is missing, {need} for {part.purpose}: {part.remedy}")
+    return "\n".join(lines)
+
+
+def complete() -> bool:
+    """Whether nothing is missing that a run on several ranks needs."""
+    return not any(part.needed and part.version is None for part in _parts())
+
+
+def describe(path: Path) -> str:
+    """What a model or a result is and holds. InputError if it is neither."""
+    from mpitled import store
+
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; give a file in it, model.h5 or result.vtkhdf")
+    if store.model_key(path) is not None:
+        return f"{path}: a model of mpitled\n{store.describe_model(path)}"
+    with store.open_result(path) as result:
+        metadata, times = result.metadata, result.times
+        versions = ", ".join(f"{name} {version}" for name, version in metadata["versions"].items())
+        reached = times[-1] if len(times) else 0.0
+        n_nodes = len(result.at_nodes("node_id"))
+        n_hexahedra = len(result.hexahedra)
+        n_domains = len(result.in_cells("cell_id")) - n_hexahedra
+        lines = [
+            f"{path}: {'a whole' if result.complete else 'an unfinished'} result of mpitled",
+            f"title            {metadata['title']}",
+            f"frames           {result.n_frames}, to {reached:g} s of {metadata['load_time_s']:g} s",
+            f"nodes            {n_nodes}",
+            f"hexahedra        {n_hexahedra}",
+            f"support domains  {n_domains}",
+            f"ranks            {metadata['ranks']}",
+            f"versions         {versions}",
+        ]
+    return "\n".join(lines)
+
+
+def _parts() -> list[_Part]:
+    def package(name: str, purpose: str, extra: str = "", needed: bool = True) -> _Part:
+        what = f"'mpitled[{extra}]'" if extra else f"'{name}'"
+        return _Part(name, _installed(name), purpose, f"pip install {what}", needed)
+
+    metis = _installed("pymetis")
+    return [
+        _Part("mpitled", __version__, "", ""),
+        _Part("Python", platform.python_version(), "", ""),
+        _Part("MPI", _asked(_mpi), "more than one rank", _SETUP),
+        _Part("mpirun", shutil.which("mpirun"), "more than one rank", _SETUP),
+        package("mpi4py", "more than one rank"),
+        _Part("HDF5", _asked(_hdf5), "every file", _SETUP),
+        _Part("HDF5 + MPI", _asked(_parallel_hdf5), "files of more than one rank (h5py built with MPI)", _SETUP),
+        package("h5py", "every file"),
+        _Part("METIS", metis and f"in pymetis {metis}", "more than one rank", "pip install 'pymetis'"),
+        package("numba", "the kernels"),
+        package("numpy", "everything"),
+        package("scipy", "building models"),
+        package("meshio", "meshes of other programs"),
+        package("nibabel", "label images", "images", needed=False),
+        package("matplotlib", "the report's pictures", "pictures", needed=False),
+        package("tqdm", "the progress bar", "progress", needed=False),
+    ]
+
+
+def _installed(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _asked(ask: Callable[[], str | None]) -> str | None:
+    """What a library says of itself; None if it is not there, or cannot be loaded."""
+    try:
+        return ask()
+    except (ImportError, OSError, RuntimeError) as error:
+        package = (getattr(error, "name", None) or "").partition(".")[0]
+        return None if package in ("", "mpi4py", "h5py") else f"not asked, for {package} is missing"
+
+
+def _mpi() -> str:
+    from mpitled.halo import library_version
+
+    return library_version()
+
+
+def _hdf5() -> str:
+    from mpitled.store import hdf5_version
+
+    return hdf5_version()
+
+
+def _parallel_hdf5() -> str | None:
+    from mpitled.store import has_mpi
+
+    return "yes" if has_mpi() else None

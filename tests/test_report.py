@@ -1,0 +1,345 @@
+"""What the report says, against closed forms; what is absent; the pictures; and the commands that print it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import complaint, mpitled
+
+from mpitled import hexahedra, info, report, store
+from mpitled.cloud import boundary_faces, fill_void, interface_faces
+from mpitled.deck import Cloud, load_deck
+from mpitled.mesh import grid_points, structured_hexahedra
+from mpitled.preprocess import build
+
+GROWTH = """
+title = "a tumour in a block"
+[block]
+size = [48.0, 40.0, 40.0]
+elements = [{elements}]
+cloud = "{cloud}"
+[tumour]
+centre = [24.0, 20.0, 20.0]
+volume = 113.1
+[cloud]
+radius = 11.0
+[material.brain]
+youngs_modulus = 3000.0
+poissons_ratio = 0.49
+[[fixed]]
+nodes = "surface"
+[solver]
+load_time = 0.1
+[output]
+frames = 2
+"""
+
+SHEAR = """
+[block]
+size = [30.0, 24.0, 24.0]
+elements = [10, 8, 8]
+cloud = "{cloud}"
+[material.brain]
+youngs_modulus = 3000.0
+poissons_ratio = 0.3
+[[fixed]]
+nodes = "z0"
+[[displaced]]
+nodes = "z1"
+displacement = [6.0, 0.0, 0.0]
+[solver]
+load_time = 2.0
+[output]
+frames = 1
+"""
+
+#: Keys of every report of a whole run, and those of a tumour in a mixed mesh and of ventricles.
+ALWAYS = {
+    "max_displacement_mm", "share_over_5mm", "min_jacobian", "energy_J", "steps", "time_step_s", "seconds", "ranks",
+    "cells", "nodes", "cell_updates_per_second", "halo_share", "peak_memory_bytes", "kinetic_to_internal",
+}  # fmt: skip
+OF_TUMOUR = {"tumour_volume_mm3", "volume_balance", "max_displacement_outside_first_ring_mm"}
+OF_VENTRICLES = {"ventricle_volume_ml", "ventricle_volume_change_ml", "max_displacement_of_ventricle_wall_mm"}
+
+
+def model_of(folder, text, **values):
+    path = folder / "scene.toml"
+    path.write_text(text.format(**values))
+    return build(load_deck(path, []))
+
+
+def outcome_of(model, move, tumour=None):
+    """A run that ended with the displacement move(X) at every place X, m."""
+    displacement = move(model.points)
+    return report.Outcome(
+        model=model,
+        field=displacement,
+        displacement=displacement,
+        domain_displacement=move(model.domain_points),
+        jacobian=np.ones(model.n_cells),
+        time=1.0,
+        complete=True,
+        metadata={"title": "", "load_time_s": 1.0, "tumour": tumour},
+        figures={},
+    )
+
+
+def test_affine_motion_changes_volumes_by_its_determinant(tmp_path):
+    """On distorted hexahedra, whose trilinear volumes an affine map multiplies by its determinant exactly."""
+    model = model_of(tmp_path, SHEAR, cloud="none")
+    rng = np.random.default_rng(0)
+    points = model.points + rng.uniform(-1e-3, 1e-3, model.points.shape)
+    half = len(model.hexahedra) // 2
+    sets = {"left_ventricle": np.arange(half), "right_ventricle": np.arange(half, len(model.hexahedra))}
+    model = replace(model, points=points, cell_sets=sets)
+    slope = rng.uniform(-0.2, 0.2, (3, 3))
+    made = report.compute(outcome_of(model, lambda X: X @ slope.T))
+    growth = np.linalg.det(np.eye(3) + slope) - 1
+    volumes = {side: made["ventricle_volume_ml"][side] for side in ("left", "right", "total")}
+    assert volumes["total"] == pytest.approx(1e6 * hexahedra.volumes(points, model.hexahedra).sum(), rel=1e-13)
+    for side, volume in volumes.items():
+        assert made["ventricle_volume_change_ml"][side] == pytest.approx(growth * volume, rel=1e-11)
+    largest = 1e3 * np.linalg.norm(points @ slope.T, axis=1).max()
+    assert made["max_displacement_mm"] == pytest.approx(largest, rel=1e-13)
+    # Together the two are the block, on whose surface an affine motion is largest.
+    assert max(made["max_displacement_of_ventricle_wall_mm"].values()) == pytest.approx(largest, rel=1e-13)
+
+
+def test_share_that_moved_far(tmp_path):
+    """u_x = 0.4 x on 10 cells of 3 mm: beyond 5 mm is x > 12.5 mm, six cells of ten and six nodes of eleven."""
+    model = model_of(tmp_path, SHEAR, cloud="none")
+    made = report.compute(outcome_of(model, lambda X: X * [0.4, 0, 0]))
+    assert made["share_over_5mm"] == {"volume": pytest.approx(6 / 10, rel=1e-13), "nodes": pytest.approx(6 / 11)}
+
+
+def swell(centre, seed_radius, radius):
+    """Displacement of the incompressible swelling of a sphere: r^3 grows by the same everywhere."""
+
+    def move(X):
+        from_centre = X - centre
+        r = np.linalg.norm(from_centre, axis=1, keepdims=True)
+        return from_centre * (np.cbrt(1 + (radius**3 - seed_radius**3) / r**3) - 1)
+
+    return move
+
+
+def test_volume_balance_of_an_incompressible_swelling(tmp_path):
+    """All that the tumour adds goes through the interface; its faces are flat where the motion is not: order h^2."""
+    errors = []
+    for elements in ("12, 10, 10", "24, 20, 20"):
+        model = model_of(tmp_path, GROWTH, elements=elements, cloud="core")
+        centre, radii = np.array([24e-3, 20e-3, 20e-3]), (2e-3, 3e-3)
+        tumour = {"centre_m": list(centre), "seed_radius_m": radii[0], "radius_m": radii[1]}
+        made = report.compute(outcome_of(model, swell(centre, *radii), tumour))
+        balance, sphere = made["volume_balance"], 4 / 3 * np.pi * 1e9
+        assert made["tumour_volume_mm3"] == pytest.approx(sphere * radii[1] ** 3, rel=1e-12)
+        assert balance["tumour_added_mm3"] == pytest.approx(sphere * (radii[1] ** 3 - radii[0] ** 3), rel=1e-12)
+        assert balance["elastic_compression_mm3"] == 0
+        errors.append(balance["relative_error"])
+        # The first ring is about a spacing wide there, and the next node moves less than the surface's 1 mm.
+        assert 0.2 < made["max_displacement_outside_first_ring_mm"] < 0.95
+    assert errors[0] < 0.02
+    assert errors[1] < errors[0] / 2.5
+
+
+def test_enclosed_volume_is_that_of_the_hexahedra():
+    """To round-off, for any motion: what the void gains, the hexahedra around it lose if their outside is held."""
+    points, cells = grid_points((5, 5, 5), (0.05, 0.05, 0.05)), structured_hexahedra((5, 5, 5))
+    points = points + np.random.default_rng(1).uniform(-3e-3, 3e-3, points.shape)
+    inside = report.enclosed_volume(points, boundary_faces(cells))
+    assert inside == pytest.approx(hexahedra.volumes(points, cells).sum(), rel=1e-13)
+
+
+def test_interface_is_where_the_cloud_is():
+    """The top of a hexahedron amid cloud is no part of it, though all its nodes are on the interface."""
+    points, cells = grid_points((3, 3, 2), (0.03, 0.03, 0.02)), structured_hexahedra((3, 3, 2))
+    dropped = np.zeros(len(cells), bool)
+    dropped[9:] = True
+    dropped[13] = False
+    filling = fill_void(points, cells, dropped, Cloud(), None, 0.01)
+    faces = interface_faces(filling.points, filling.hexahedra, filling.interface, filling.integration_points)
+    heights = filling.points[faces].mean(axis=1)[:, 2]
+    assert sorted(np.round(heights, 6)) == [0.01] * 8 + [0.015] * 4
+
+
+@pytest.fixture(scope="module")
+def grown(tmp_path_factory):
+    """A tumour in a mixed block, run by the command; its folder and what was printed."""
+    folder = tmp_path_factory.mktemp("grown")
+    (folder / "scene.toml").write_text(GROWTH.format(elements="12, 10, 10", cloud="core"))
+    done = mpitled("run", folder / "scene.toml", "--out", folder / "out")
+    return folder / "out", done.stdout
+
+
+def strictly(path):
+    """JSON without the numbers that JSON does not have."""
+    return json.loads(path.read_text(), parse_constant=pytest.fail)
+
+
+def test_report_of_a_run(grown):
+    folder, printed = grown
+    made = strictly(folder / "report.json")
+    assert made.keys() >= ALWAYS | OF_TUMOUR
+    assert not made.keys() & OF_VENTRICLES
+    assert made["complete"]
+    assert made["tumour_volume_mm3"] == pytest.approx(113.1, rel=1e-9)
+    assert made["max_displacement_mm"] == pytest.approx(1.0, abs=0.1)  # R - r0, but for the field
+    balance = made["volume_balance"]
+    added = balance["tumour_added_mm3"]
+    rest = added - balance["pushed_through_interface_mm3"] - balance["elastic_compression_mm3"]
+    assert balance["relative_error"] == pytest.approx(abs(rest) / added, rel=1e-9)
+    assert balance["relative_error"] < 0.1
+    for line in (
+        "113.1 mm3",
+        "volume balance, error",
+        "smallest J",
+        "kinetic/internal",
+        "undeformed.png, deformed.png",
+    ):
+        assert line in printed
+    assert "ventricle" not in printed
+
+
+def test_report_command_says_the_same_again(grown):
+    folder, _ = grown
+    before = strictly(folder / "report.json")
+    (folder / "report.json").unlink()
+    (folder / "deformed.png").unlink()
+    printed = mpitled("report", folder).stdout
+    after = strictly(folder / "report.json")
+    for made in (before, after):
+        made.pop("seconds")
+    assert after == before
+    assert "113.1 mm3" in printed
+    assert (folder / "deformed.png").exists()
+
+
+def test_pictures_show_the_cuts(grown):
+    image = pytest.importorskip("matplotlib.image")
+    pixels = {name: image.imread(grown[0] / f"{name}.png")[..., :3] for name in ("undeformed", "deformed")}
+    for picture in pixels.values():
+        coloured = np.ptp(picture, axis=-1) > 0.05  # neither white, black nor grey
+        assert coloured.mean() > 0.2
+        assert len(np.unique(np.round(picture[coloured], 2), axis=0)) > 100
+    assert pixels["undeformed"].shape == pixels["deformed"].shape  # the same frame, so that they can be compared
+    assert (pixels["undeformed"] != pixels["deformed"]).mean() > 0.01
+
+
+@pytest.mark.parametrize("cloud", ["none", "core", "all"])
+def test_scenes_without_a_tumour(tmp_path, cloud):
+    (tmp_path / "scene.toml").write_text(SHEAR.format(cloud=cloud))
+    printed = mpitled("run", tmp_path / "scene.toml", "--out", tmp_path / "out").stdout
+    made = strictly(tmp_path / "out" / "report.json")
+    assert made.keys() >= ALWAYS
+    assert not made.keys() & (OF_TUMOUR | OF_VENTRICLES)
+    assert "tumour as reached" not in printed
+    assert made["pictures"] == ["undeformed.png", "deformed.png"]
+
+
+def test_unfinished_results_without_figures(tmp_path):
+    """What a killed run left, and numbers that are none: what is unknown is absent or null."""
+    model = model_of(tmp_path, SHEAR, cloud="core")
+    store.write_model(tmp_path / "model.h5", model, "key")
+    rows = store.read_part(tmp_path / "model.h5", 1, 0)
+    writer = store.ResultWriter(tmp_path, None, rows, 3, {"title": "killed", "load_time_s": 2.0, "tumour": None})
+    moved = np.full((model.n_nodes + len(model.domains), 3), 1e-3)
+    for time in (0.0, 0.5):
+        values = {"displacement": time * moved, "field_displacement": time * moved}
+        writer.write_frame(time, values, {"J": np.ones(model.n_cells)})
+    writer.abandon({"min_jacobian": float("nan"), "peak_memory_bytes": [1, 2]})
+    printed = mpitled("report", tmp_path).stdout
+    assert "not complete: 25.0% of the load time" in printed
+    assert "smallest J" not in printed
+    made = strictly(tmp_path / "report.json")
+    assert not made["complete"]
+    assert made["min_jacobian"] is None
+    assert made["max_displacement_mm"] == pytest.approx(np.sqrt(3) / 2)
+
+    store.write_model(tmp_path / "model.h5", replace(model, points=model.points + 1), "key")
+    assert "model.h5" in complaint(mpitled("report", tmp_path, status=2))
+    assert "no such file" in complaint(mpitled("report", tmp_path / "nowhere", status=2))
+
+
+def test_report_goes_on_without_matplotlib(grown, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    made = report.write(grown[0])
+    assert "pip install" in made["pictures"]
+    assert made["pictures"] in report.table(made)
+
+
+def test_cuts_are_exact():
+    """A slanted plane through a cube, x + y + z = 1.2: the area is closed, and linear values are met."""
+    plot = pytest.importorskip("mpitled.plot")
+    points, cells = grid_points((3, 3, 3), (1.0, 1.0, 1.0)), structured_hexahedra((3, 3, 3))
+    vertices = np.concatenate([points, points[cells].mean(axis=1)])
+    triangles = plot._triangles(cells[:, plot.FACES].reshape(-1, 4))
+    middle = np.tile(np.repeat(len(points) + np.arange(len(cells)), 6), 2)
+    height = vertices.sum(axis=1) - 1.2
+    pieces = plot.cut_tetrahedra(vertices, height, np.column_stack([triangles, middle]))
+    np.testing.assert_allclose(pieces.sum(axis=2), 1.2, rtol=1e-14)
+    area = np.linalg.norm(np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0]), axis=1).sum() / 2
+    assert area == pytest.approx(np.sqrt(3) / 2 * (1.2**2 - 3 * 0.2**2), rel=1e-13)
+
+
+def test_the_cloud_is_drawn_without_holes(tmp_path):
+    """Random places of the cloud in a plane through the middle: each is in a piece of the cut."""
+    plot = pytest.importorskip("mpitled.plot")
+    model = model_of(tmp_path, GROWTH, elements="12, 10, 10", cloud="core")
+    solid = plot._solid(model, np.zeros_like(model.points))
+    height = solid.points[:, 0] - 25.0  # between the hexahedra's layers
+    pieces = plot.cut_tetrahedra(solid.points[:, [1, 2]], height, solid.cloud)
+    places = np.random.default_rng(2).uniform(0, 40, (4000, 2))
+    corners = solid.points[solid.hexahedra]
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    low, high = (end[(low[:, 0] < 25) & (high[:, 0] > 25), 1:] for end in (low, high))
+    in_hexahedra = ((places[:, None] > low) & (places[:, None] < high)).all(axis=2).any(axis=1)
+    places = places[~in_hexahedra & (np.linalg.norm(places - 20, axis=1) > np.sqrt(3.0))]  # the seed cut at 1 mm
+    assert len(places) > 700
+    offsets = pieces[:, None] - places[None, :, None]  # (pieces, places, 3, 2)
+    following = np.roll(offsets, -1, axis=2)
+    sides = offsets[..., 0] * following[..., 1] - offsets[..., 1] * following[..., 0]
+    inside = (sides > -1e-9).all(axis=2) | (sides < 1e-9).all(axis=2)
+    assert inside.any(axis=0).all()
+
+
+def test_info_of_the_machine_and_of_files(grown):
+    printed = mpitled("info").stdout
+    for name in ("mpitled", "Python", "MPI", "HDF5", "h5py", "METIS", "numba"):
+        assert any(line.startswith(name) for line in printed.splitlines())
+    assert importlib.metadata.version("numba") in printed
+    assert "a whole result" in mpitled("info", grown[0] / "result.vtkhdf").stdout
+    assert "a model" in mpitled("info", grown[0] / "model.h5").stdout
+    assert "folder" in complaint(mpitled("info", grown[0], status=2))
+    assert "report.json" in complaint(mpitled("info", grown[0] / "report.json", status=2))
+
+
+def test_info_names_what_is_missing(monkeypatch):
+    """It must not fail with what it is to report."""
+    code = (
+        "import sys; sys.modules.update(mpi4py=None, h5py=None, matplotlib=None)\n"
+        "from mpitled import info; print(info.table()); sys.exit(info.complete())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=os.environ)
+    assert done.returncode == 0, done.stderr
+    assert "MPI is missing, needed for more than one rank" in done.stdout
+    assert "HDF5 is missing" in done.stdout
+
+    installed = importlib.metadata.version
+
+    def version(name):
+        if name in ("pymetis", "nibabel"):
+            raise importlib.metadata.PackageNotFoundError(name)
+        return installed(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    table = info.table()
+    assert "METIS is missing, needed for more than one rank: pip install 'pymetis'" in table
+    assert "nibabel is missing, useful for label images: pip install 'mpitled[images]'" in table
+    assert not info.complete()
