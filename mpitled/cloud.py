@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpitled.errors import InputError
-from mpitled.mesh import CORNERS
+from mpitled.mesh import CORNERS, Mesh, numbered_mesh
 
 if TYPE_CHECKING:
     from mpitled import deck
@@ -99,7 +99,7 @@ def fill_void(
     Raises InputError if nothing is dropped, if no node fits in, or if the seed does not lie inside the void.
     """
     if not dropped.any():
-        raise InputError("cloud: no hexahedron is replaced by it; enlarge cloud.radius or block.core_share")
+        raise InputError("cloud: no hexahedron is replaced by it; enlarge cloud.radius or core_share")
     corners = points[hexahedra[dropped]]
     boundary = boundary_faces(hexahedra[dropped])
     seed, spacing = _seed(cloud, tumour, element_size)
@@ -142,6 +142,31 @@ def fill_void(
         seed_nodes=np.arange(len(kept), len(kept) + len(seed)),
         spacing=spacing,
         figures=figures,
+    )
+
+
+def with_cloud(
+    points: NDArray[np.float64],
+    hexahedra: NDArray[np.int64],
+    dropped: NDArray[np.bool_],
+    node_sets: dict[str, NDArray[np.int64]],
+    cloud: deck.Cloud,
+    tumour: deck.Tumour | None,
+    element_size: float,
+) -> Mesh:
+    """The mesh with a cloud in place of the dropped hexahedra (see `fill_void`), with sets interface and tumour."""
+    filling = fill_void(points, hexahedra, dropped, cloud, tumour, element_size)
+    node_sets = {name: filling.renumber(nodes) for name, nodes in node_sets.items()} | {"interface": filling.interface}
+    if tumour is not None:
+        node_sets["tumour"] = filling.seed_nodes
+    return numbered_mesh(
+        filling.points,
+        filling.n_fe_nodes,
+        filling.hexahedra,
+        filling.integration_points,
+        filling.integration_volumes,
+        node_sets,
+        filling.figures,
     )
 
 

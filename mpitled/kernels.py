@@ -682,6 +682,16 @@ def domain_survey(  # type: ignore[no-untyped-def]
 # ---------------------------------------------------------------- nodes
 
 
+@njit(cache=True)
+def follow(path, full, turns, amplitude):  # type: ignore[no-untyped-def]
+    """Displacements (n,), m, of dofs at that share of the load on the arcs of `loading.turn`; exact at full load."""
+    for p in range(path.size):
+        angle, arm, across = turns[p, 0], turns[p, 1], turns[p, 2]
+        arc = (np.cos(amplitude * angle) - 1) * arm + np.sin(amplitude * angle) * across
+        end = (np.cos(angle) - 1) * arm + np.sin(angle) * across
+        path[p] = amplitude * (full[p] - end) + arc
+
+
 @_kernel
 def react(u, u_prev, f, mass, dofs, full, amplitude, reaction, time_step):  # type: ignore[no-untyped-def]
     """Work (J) of the reactions at moving dofs over the last step, by the trapezoidal rule; renews the reactions.

@@ -89,8 +89,8 @@ class March:
     def look(self) -> dict[str, float]:
         """This rank's share of the figures at the present time, for which the forces are there.
 
-        Sums: "external", "strain", "hourglass", "stabilisation", "kinetic", "added", "dissipated" in J, "added_mass" in kg.
-        Extremes: "min_jacobian" (of all steps), "step_ratio": the step over the one that the bound proves stable.
+        Sums, in J: "external", "strain", "hourglass", "stabilisation", "kinetic", "added", "dissipated"; in kg:
+        "added_mass". Extremes: "min_jacobian" (of all steps), "step_ratio": the step over the one proved stable.
         """
         s, required = self.state, self.survey.required[0]
         found = self.survey.look(s, self.safety)

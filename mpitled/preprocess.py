@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import block, hexahedra, labels, support
+from mpitled import block, hexahedra, labels, phantoms, support
 from mpitled.deck import Deck
 from mpitled.errors import InputError
-from mpitled.loading import growth
+from mpitled.loading import growth, turn
 from mpitled.material import Material
 from mpitled.mesh import Mesh, named_set
 from mpitled.model import Model
@@ -27,7 +27,11 @@ def read_mesh(deck: Deck) -> Mesh:
         return labels.mesh_labels(deck.labels, deck.cloud, deck.tumour)
     if deck.block:
         return block.block_mesh(deck.block, deck.cloud, deck.tumour)
-    assert deck.mesh is not None  # load_deck sees to one of the three
+    if deck.cylinder:
+        return phantoms.cylinder_mesh(deck.cylinder, deck.cloud, deck.tumour)
+    if deck.ellipsoid:
+        return phantoms.ellipsoid_mesh(deck.ellipsoid, deck.cloud, deck.tumour)
+    assert deck.mesh is not None  # load_deck sees to exactly one geometry
     from mpitled import reader
 
     return reader.read_mesh(deck.mesh)
@@ -47,7 +51,7 @@ def build(deck: Deck) -> Model:
     n_fe_nodes, points = mesh.n_fe_nodes, mesh.points
     shapes, gradients, condition = support.moving_least_squares(points[domains], at, options.basis, options.weight)
     field_domains, field_shapes = support.field_at_nodes(points, n_fe_nodes, at, domains, options.basis, options.weight)
-    dofs, displacements = prescribe(deck, mesh)
+    dofs, displacements, turns = prescribe(deck, mesh)
 
     fe_gradients, fe_volumes = hexahedra.geometry(points, mesh.hexahedra, deck.hexahedra.gradient)
     figures = dict(mesh.figures)
@@ -103,6 +107,7 @@ def build(deck: Deck) -> Model:
         mass=mass,
         prescribed_dofs=dofs,
         prescribed_displacements=displacements,
+        prescribed_turns=turns,
         node_sets=mesh.node_sets,
         cell_sets=mesh.cell_sets,
         figures=figures,
@@ -183,17 +188,21 @@ def _without(orphans: NDArray[np.int64], mesh: Mesh, domains: NDArray[np.int64])
     return kept, number[domains]
 
 
-def prescribe(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Prescribed dofs (3 node + direction, ascending) and their displacements (m) at full load.
+def prescribe(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Prescribed dofs (3 node + direction, ascending), their displacements (m) at full load, and their turns (n, 3).
 
     InputError if a dof is asked to be in two places, or nothing at all is prescribed.
     """
-    dofs, values, origins = [], [], []
+    dofs, values, turns, origins = [], [], [], []
     for constraint in (*deck.constraints(), *mesh.constraints):
         nodes = named_set(mesh.node_sets, constraint.node_set, constraint.origin)
+        turned, arcs = np.zeros((len(nodes), 3)), np.zeros((len(nodes), 3, 3))
+        if constraint.rotation:
+            turned, arcs = turn(mesh.points[nodes], constraint.rotation)
         for direction, displacement in zip(constraint.directions, constraint.displacement, strict=True):
             dofs.append(3 * nodes + direction)
-            values.append(np.full(len(nodes), displacement))
+            values.append(displacement + turned[:, direction])
+            turns.append(arcs[:, direction])
             origins.append(constraint.origin)
     if deck.tumour:
         origin = f"{deck.path}: tumour"
@@ -201,12 +210,13 @@ def prescribe(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.flo
         moved = growth(mesh.points[nodes], np.array(deck.tumour.centre), deck.tumour.seed_radius, deck.tumour.volume)
         dofs.append((3 * nodes[:, None] + np.arange(3)).ravel())
         values.append(moved.ravel())
+        turns.append(np.zeros((moved.size, 3)))
         origins.append(origin)
     if not dofs:
         raise InputError(f"{deck.path}: nothing is fixed, displaced or grows; add [[fixed]], [[displaced]] or [tumour]")
     every, at, source = np.concatenate(dofs), np.concatenate(values), np.repeat(np.arange(len(dofs)), [*map(len, dofs)])
     order = np.lexsort((at, every))
-    every, at, source = every[order], at[order], source[order]
+    every, at, source, turning = every[order], at[order], source[order], np.concatenate(turns)[order]
     clash = np.flatnonzero((np.diff(every) == 0) & (np.diff(at) != 0))
     if len(clash):
         first = clash[0]
@@ -217,4 +227,4 @@ def prescribe(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.flo
             f"take it out of one of the two ({len(clash)} such)"
         )
     keep = np.append(True, np.diff(every) > 0)
-    return every[keep], at[keep]
+    return every[keep], at[keep], turning[keep]

@@ -52,13 +52,8 @@ def at_rest(sub: Subdomain, load_time: float, time_step: float) -> State:
     """The undeformed state, with the model's masses."""
     u, u_prev, f = (np.zeros((3, sub.n_nodes + kernels.PADDING)) for _ in range(3))
     mass = sub.rows.mass.copy()
-    return State(u, u_prev, f, mass, time_step**2 / mass, np.zeros(len(_owned_moving(sub)[0])), load_time, time_step)
-
-
-def _owned_moving(sub: Subdomain) -> tuple[NDArray[np.uint32], NDArray[np.float64]]:
-    """Moving dofs that this rank owns, and their displacements at full load."""
-    owned = sub.rows.owned[sub.moving // 3]
-    return sub.moving[owned], sub.moving_full[owned]
+    owned_moving = int(np.count_nonzero(sub.rows.owned[sub.moving // 3]))
+    return State(u, u_prev, f, mass, time_step**2 / mass, np.zeros(owned_moving), load_time, time_step)
 
 
 def compose_forces(sub: Subdomain, halo: Halo | None) -> tuple[Term, ...]:
@@ -94,44 +89,65 @@ def compose_forces(sub: Subdomain, halo: Halo | None) -> tuple[Term, ...]:
     return tuple(terms)
 
 
+@dataclass(frozen=True, slots=True)
+class _Motion:
+    """Where the moving dofs go next: a share of where they go at full load, or, on arcs, what a term has computed."""
+
+    full: NDArray[np.float64]  # (n moving dofs,), m
+    dofs: NDArray[np.uint32]  # (n owned moving dofs,)
+    own_full: NDArray[np.float64]  # m
+    share: Callable[[State], float]  # of full and own_full
+    terms: tuple[Term, ...]  # taken before the share is asked for
+
+
+def _compose_motion(sub: Subdomain) -> _Motion:
+    owned = sub.rows.owned[sub.moving // 3]
+    full, turns = sub.moving_full, sub.moving_turns
+    dofs, own_full = sub.moving[owned], full[owned]
+    if turns is None:
+        return _Motion(full, dofs, own_full, lambda s: s.next_load, ())
+    ends, own_ends, own_turns = full, own_full, turns[owned]
+    full, own_full = full.copy(), own_full.copy()
+
+    def follow(s: State) -> None:
+        kernels.follow(full, ends, turns, s.next_load)
+        kernels.follow(own_full, own_ends, own_turns, s.next_load)
+
+    return _Motion(full, dofs, own_full, lambda s: 1.0, (("motion", follow),))
+
+
 def compose_march(sub: Subdomain) -> tuple[Term, ...]:
     """The terms that move the nodes by their masses: the reactions where any dof moves, then the central difference."""
+    m = _compose_motion(sub)
 
     def reactions(s: State) -> None:
-        s.external_work += kernels.react(s.u, s.u_prev, s.f, s.mass, dofs, full, s.next_load, s.reaction, s.time_step)
+        s.external_work += kernels.react(
+            s.u, s.u_prev, s.f, s.mass, m.dofs, m.own_full, m.share(s), s.reaction, s.time_step
+        )
 
     def update(s: State) -> None:
-        kernels.update(s.u, s.u_prev, s.f, s.mobility, sub.fixed, sub.moving, sub.moving_full, s.next_load)
+        kernels.update(s.u, s.u_prev, s.f, s.mobility, sub.fixed, sub.moving, m.full, m.share(s))
         _advance(s)
 
-    dofs, full = _owned_moving(sub)
-    return (*((("reactions", reactions),) if len(dofs) else ()), ("update", update))
+    return (*m.terms, *((("reactions", reactions),) if len(m.dofs) else ()), ("update", update))
 
 
 def compose_relaxation(sub: Subdomain, counted: NDArray[np.float64]) -> tuple[Term, ...]:
     """As `compose_march`, damped, and with a mass tensor at each node; counted (3, n_nodes): see `kernels.relax`."""
+    m = _compose_motion(sub)
 
     def reactions(s: State) -> None:
-        s.external_work += kernels.react(s.u, s.u_prev, s.f, None, dofs, full, s.next_load, s.reaction, s.time_step)
+        s.external_work += kernels.react(
+            s.u, s.u_prev, s.f, None, m.dofs, m.own_full, m.share(s), s.reaction, s.time_step
+        )
 
     def relax(s: State) -> None:
         s.free_work += kernels.relax(
-            s.u,
-            s.u_prev,
-            s.f,
-            s.mobility,
-            counted,
-            sub.fixed,
-            sub.moving,
-            sub.moving_full,
-            s.next_load,
-            s.retain,
-            s.gain,
+            s.u, s.u_prev, s.f, s.mobility, counted, sub.fixed, sub.moving, m.full, m.share(s), s.retain, s.gain
         )
         _advance(s)
 
-    dofs, full = _owned_moving(sub)
-    return (*((("reactions", reactions),) if len(dofs) else ()), ("update", relax))
+    return (*m.terms, *((("reactions", reactions),) if len(m.dofs) else ()), ("update", relax))
 
 
 def rehearse(s: State, terms: tuple[Term, ...]) -> None:

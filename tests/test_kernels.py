@@ -52,6 +52,7 @@ def part(points, cells, domains, gradients, volumes, material, prescribed=((), (
         materials=(BRAIN, SOFT),
         prescribed_dofs=np.asarray(prescribed[0], np.int64),
         prescribed_displacements=np.asarray(prescribed[1], float),
+        prescribed_turns=np.zeros((len(prescribed[1]), 3)),
         field_nodes=nothing,
         field_domains=nothing,
         field_shapes=np.zeros((0, 8)),

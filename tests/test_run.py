@@ -123,13 +123,13 @@ def test_homogeneous_stretch_has_its_closed_form(tmp_path, cloud):
 
 @pytest.mark.parametrize("cloud", ["none", "core"])
 def test_relaxation_reaches_the_static_solution_in_few_steps(tmp_path, cloud):
-    """To the tolerance asked for, by its own estimate and in truth, in a fifth of the ramp's steps."""
-    path = deck(tmp_path, STRETCH, cloud=cloud, millimetres=6.0, load_time=0.5)
+    """To the tolerance asked for, by its own estimate and in truth, in a fifth of the steps of a ramp."""
+    path = deck(tmp_path, STRETCH, cloud=cloud, millimetres=6.0, load_time=1.0)
     steps = {}
     for method in ("quasi-static", "dynamic-relaxation"):
         mpitled(
             "run", path, "--out", tmp_path / method, "--set", f"solver.method={method}", "--set",
-            "solver.load_steps=100", "--set", "solver.tolerance=1e-5",
+            "solver.load_steps=100", "--set", "solver.tolerance=1e-3",
         )  # fmt: skip
         with open_result(tmp_path / method) as result:
             figures = result.figures
@@ -137,9 +137,9 @@ def test_relaxation_reaches_the_static_solution_in_few_steps(tmp_path, cloud):
             exact = result.points * [0.2, m - 1, m - 1]
             error = np.abs(result.point_data("displacement", -1) - exact).max()
             steps[method] = figures["steps"]
-            assert result.times[-1] == (1.0 if method == "dynamic-relaxation" else 0.5)
-    assert figures["static_distance_mm"] < 1e-5
-    assert 1e3 * error < 3e-5
+            assert result.times[-1] == 1.0  # s, or the share of the load
+        assert figures["static_distance_mm"] < (1e-3 if method == "dynamic-relaxation" else 0.1)
+        assert 1e3 * error < 3 * figures["static_distance_mm"]
     assert figures["energy_J"]["balance_error"] < 1e-3  # second order in the step at the load's fastest
     assert 5 * steps["dynamic-relaxation"] < steps["quasi-static"]
 
@@ -172,7 +172,9 @@ def test_one_two_and_four_ranks_agree_and_repeat(tmp_path):
     mpitled("run", path, "--out", tmp_path / "again", n=2)
     one = final(tmp_path / "1")
     largest = np.abs(one[0]).max()
-    assert largest == pytest.approx(3e-3, rel=0.01)  # R - r0
+    with open_result(tmp_path / "1") as result:
+        moved = np.linalg.norm(result.at_nodes("displacement", -1), axis=1).max()
+    assert moved == pytest.approx(3e-3, rel=1e-3)  # R - r0, the volume having four digits
     for n in (2, 4):
         for other, values in zip(final(tmp_path / str(n)), one, strict=True):
             assert np.abs(other - values).max() < 1e-8 * largest
@@ -198,7 +200,7 @@ def test_copies_of_shared_nodes_have_the_same_bits(tmp_path, n):
 
 def test_ranks_without_one_kind_of_cell(tmp_path):
     """A cloud at one end: of four parts some have no support domains, or no hexahedra."""
-    text = GROWTH.replace("[48.0, 40.0, 40.0]", "[96.0, 20.0, 20.0]").replace("[12, 10, 10]", "[24, 5, 5]")
+    text = GROWTH.replace("[48.0, 40.0, 40.0]", "[240.0, 20.0, 20.0]").replace("[12, 10, 10]", "[60, 5, 5]")
     text = text.replace("[24.0, 20.0, 20.0]", "[12.0, 10.0, 10.0]").replace("radius = 11.0", "radius = 9.0")
     path = deck(tmp_path, text, volume=60.0)
     for n in (1, 4):
@@ -268,7 +270,7 @@ def test_a_step_above_the_critical_one_is_refused_with_the_one_to_use(tmp_path, 
 @pytest.mark.parametrize("n", [1, 2])
 def test_an_unstable_run_stops_and_says_why(tmp_path, n):
     """A block pressed through itself: no step and no mass can save it."""
-    path = deck(tmp_path, STRETCH, cloud="core", millimetres=-33.0, load_time=0.1)
+    path = deck(tmp_path, STRETCH, cloud="core", millimetres=-45.0, load_time=0.1)
     line = complaint(mpitled("run", path, "--out", tmp_path / "out", n=n, status=3))
     for word in ("unstable at", "mm", "J = ", "rank", "brain", "load_time"):
         assert word in line
