@@ -56,12 +56,10 @@ def build(deck: Deck) -> Model:
     fe_gradients, fe_volumes = hexahedra.geometry(points, mesh.hexahedra, deck.hexahedra.gradient)
     figures = dict(mesh.figures)
     if options.consistency and len(domains):
-        free = np.zeros(len(points), bool)
-        free[domains] = True
-        for name in OUTER:
-            free[mesh.node_sets.get(name, [])] = False
-        free[dofs // 3] = False
-        balance = support.nodal_sum(mesh.hexahedra, fe_volumes[:, None, None] * fe_gradients, len(points))
+        balance = hexahedra.nodal_sum(mesh.hexahedra, fe_volumes[:, None, None] * fe_gradients, len(points))
+        free, surface = _surface(mesh, balance, dofs // 3)
+        free &= np.bincount(domains.ravel(), minlength=len(points)) > 0
+        balance = balance - surface
         gradients, corrected = support.correct_consistency(points[domains], domains, gradients, volumes, balance, free)
         figures |= corrected
 
@@ -124,10 +122,39 @@ def _limits(deck: Deck, mesh: Mesh) -> tuple[list[support.Limit], NDArray[np.boo
     """
     fe = np.arange(mesh.n_nodes) < mesh.n_fe_nodes
     seed = np.zeros(mesh.n_nodes, bool)
-    seed[mesh.node_sets.get(TUMOUR, [])] = True
+    seed[_members(mesh, TUMOUR)] = True
     wanted = ~fe
-    wanted[mesh.node_sets.get("interface", [])] = True
+    wanted[_members(mesh, "interface")] = True
     return [(fe, deck.support.max_fe_nodes), (seed, deck.support.nodes // 2)], wanted
+
+
+def _surface(
+    mesh: Mesh, fe_balance: NDArray[np.float64], prescribed: NDArray[np.int64]
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Nodes at which the surface's share of a constant stress is known, and that share (n_nodes, 3), m^2.
+
+    It is what hexahedra alone leave (fe_balance) at nodes that have all of theirs, and nothing inside the cloud. On the
+    cloud's boundary the mesher knows it; where a file does not say, nodes that are outer or prescribed are left out.
+    The seed's surface is curved between its nodes: its share is only known roughly.
+    """
+    known = np.ones(mesh.n_nodes, bool)
+    whole = np.arange(mesh.n_nodes) < mesh.n_fe_nodes
+    whole[_members(mesh, "interface")] = False
+    surface = np.where(whole[:, None], fe_balance, 0.0)
+    if mesh.surface_areas is not None:
+        surface[~whole] = mesh.surface_areas[~whole]
+    else:
+        known[prescribed] = False
+        for name in OUTER:
+            known[_members(mesh, name)] = False
+        known |= whole
+    known[_members(mesh, TUMOUR)] = False
+    return known, surface
+
+
+def _members(mesh: Mesh, name: str) -> NDArray[np.int64]:
+    """Nodes of a set; none if there is no such set."""
+    return mesh.node_sets.get(name, np.empty(0, np.int64))
 
 
 def _shared(
@@ -183,6 +210,7 @@ def _without(orphans: NDArray[np.int64], mesh: Mesh, domains: NDArray[np.int64])
         points=mesh.points[keep],
         node_ids=mesh.node_ids[keep],
         node_sets=sets,
+        surface_areas=None if mesh.surface_areas is None else mesh.surface_areas[keep],
         remarks=(*mesh.remarks, remark),
     )
     return kept, number[domains]
