@@ -299,8 +299,8 @@ class _Run:
             cell = world.broadcast(self._worst_cell() if world.rank == worst else None, worst)
             raise UnstableError(
                 f"unstable at {state.share:.1%} of the load: {reason}; {cell}; the step is "
-                f"{figures['step_ratio']:.2f} of the longest proved stable; load more slowly (solver.load_time, solver.load_steps), refine the mesh or "
-                "the cloud there, or enlarge cloud.radius"
+                f"{figures['step_ratio']:.2f} of the longest proved stable; load more slowly (solver.load_time, "
+                "solver.load_steps), refine the mesh or the cloud there, or enlarge cloud.radius"
             )
         if table[:, -1].any():
             raise InterruptedRun(f"interrupted at {state.share:.1%} of the load; what was written is readable")
