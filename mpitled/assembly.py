@@ -36,6 +36,8 @@ class Entry:
 
 @dataclass(slots=True)
 class Set:
+    """A set of nodes or elements as the deck gives it, bit by bit."""
+
     name: str  # as first written
     entries: list[Entry] = field(default_factory=list)
 
@@ -83,6 +85,8 @@ class Placed:
 
 @dataclass(slots=True)
 class Material:
+    """What the options under *MATERIAL say."""
+
     name: str
     origin: str
     elastic: tuple[float, float] | None = None

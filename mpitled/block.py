@@ -5,18 +5,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mpitled.cloud import fill_void
+from mpitled.cloud import with_cloud
 from mpitled.errors import InputError
-from mpitled.mesh import Mesh, grid_points, structured_hexahedra
+from mpitled.mesh import Mesh, grid_points, hexahedral_mesh, structured_hexahedra
 
 if TYPE_CHECKING:
     from mpitled import deck
 
 
 def block_mesh(block: deck.Block, cloud: deck.Cloud, tumour: deck.Tumour | None) -> Mesh:
-    """The mesh of a block [0, size] with its faces as node sets x0, x1, y0, y1, z0, z1 and, together, surface.
+    """The mesh of a block with its faces as node sets x0, x1, y0, y1, z0, z1 and, together, surface.
 
     A core cloud takes about `core_share` of the hexahedra along each side, in the middle, or, with a tumour,
     those within `cloud.radius` of its centre. Raises InputError for a tumour without a cloud or without room.
@@ -28,7 +27,7 @@ def block_mesh(block: deck.Block, cloud: deck.Cloud, tumour: deck.Tumour | None)
         # The cloud has its boundary nodes from the elements that it replaces: they follow its spacing.
         shape = np.maximum(np.rint(size / cloud.spacing), 1).astype(np.int64)
     nx, ny, nz = (int(n) for n in shape)
-    points = grid_points((nx, ny, nz), (size[0], size[1], size[2]))
+    points = np.asarray(block.corner) + grid_points((nx, ny, nz), (size[0], size[1], size[2]))
     hexahedra = structured_hexahedra((nx, ny, nz))
     index = np.indices((nz + 1, ny + 1, nx + 1)).reshape(3, -1)[::-1].T
     node_sets = {
@@ -37,7 +36,7 @@ def block_mesh(block: deck.Block, cloud: deck.Cloud, tumour: deck.Tumour | None)
     surface = node_sets["surface"] = np.unique(np.concatenate(list(node_sets.values())))
 
     if block.cloud == "none":
-        return _mesh(points, len(points), hexahedra, np.empty((0, 3)), np.empty(0), node_sets, {})
+        return hexahedral_mesh(points, hexahedra, node_sets)
     if block.cloud == "all":
         # Along faces and edges only: no node leaves a face, no corner moves, and the volume stays.
         free = (index[surface] > 0) & (index[surface] < shape)
@@ -52,39 +51,4 @@ def block_mesh(block: deck.Block, cloud: deck.Cloud, tumour: deck.Tumour | None)
     else:
         middle = points[hexahedra].mean(axis=1)
         dropped = np.linalg.norm(middle - np.asarray(tumour.centre), axis=1) <= cloud.radius
-    filling = fill_void(points, hexahedra, dropped, cloud, tumour, float((size / shape).prod() ** (1 / 3)))
-    node_sets = {name: filling.renumber(nodes) for name, nodes in node_sets.items()} | {"interface": filling.interface}
-    if tumour is not None:
-        node_sets["tumour"] = filling.seed_nodes
-    return _mesh(
-        filling.points,
-        filling.n_fe_nodes,
-        filling.hexahedra,
-        filling.integration_points,
-        filling.integration_volumes,
-        node_sets,
-        filling.figures,
-    )
-
-
-def _mesh(
-    points: NDArray[np.float64],
-    n_fe_nodes: int,
-    hexahedra: NDArray[np.int64],
-    integration_points: NDArray[np.float64],
-    integration_volumes: NDArray[np.float64],
-    node_sets: dict[str, NDArray[np.int64]],
-    figures: dict[str, float],
-) -> Mesh:
-    cells = np.arange(len(hexahedra) + len(integration_points))
-    return Mesh(
-        points=points,
-        n_fe_nodes=n_fe_nodes,
-        hexahedra=hexahedra,
-        integration_points=integration_points,
-        integration_volumes=integration_volumes,
-        node_sets=node_sets,
-        cell_sets={"all": cells, "hexahedra": cells[: len(hexahedra)], "cloud": cells[len(hexahedra) :]},
-        node_ids=np.arange(1, len(points) + 1),
-        figures=figures,
-    )
+    return with_cloud(points, hexahedra, dropped, node_sets, cloud, tumour, float((size / shape).prod() ** (1 / 3)))

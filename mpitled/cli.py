@@ -1,8 +1,9 @@
-"""The command line: `mpitled run|build|check|export|partition|report|info`."""
+"""The command line: `mpitled run|build|check|export|partition|report|compare|info`."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import sys
 import traceback
@@ -84,6 +85,17 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("directory", type=Path, help="the folder that a run wrote")
     report.set_defaults(command=_report)
 
+    compare = commands.add_parser("compare", help="errors of a result against a reference, in mm")
+    compare.add_argument("result", type=Path, help="the folder that a run wrote")
+    compare.add_argument(
+        "reference", type=Path, help=".npz, .csv, .vtu or .vtkhdf in metres, or a folder of another run"
+    )
+    compare.add_argument(
+        "--beyond", type=float, metavar="MM", help="also only places farther than this from edges of prescribed surface"
+    )
+    compare.add_argument("--json", action="store_true", help="JSON instead of a table")
+    compare.set_defaults(command=_compare)
+
     info = commands.add_parser("info", help="versions of what mpitled works with, and what is missing; or of a file")
     info.add_argument("file", type=Path, nargs="?", help="model.h5 or result.vtkhdf: say what it is and holds")
     info.set_defaults(command=_info)
@@ -161,6 +173,13 @@ def _report(options: argparse.Namespace) -> None:
     from mpitled import report
 
     print(report.table(report.write(options.directory)))
+
+
+def _compare(options: argparse.Namespace) -> None:
+    from mpitled import compare
+
+    figures = compare.compare(options.result, options.reference, options.beyond and options.beyond / 1e3)
+    print(json.dumps(figures, indent=2) if options.json else compare.table(figures))
 
 
 def _info(options: argparse.Namespace) -> int:

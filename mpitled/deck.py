@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_ty
 
 from mpitled.errors import InputError
 from mpitled.material import Material
-from mpitled.mesh import Constraint
+from mpitled.mesh import Constraint, Rotation
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -26,7 +26,7 @@ else:
     import tomli as tomllib
 
 #: Units of the deck that are not SI: how many make one SI unit. Dividing by a power of ten rounds 5.1 mm to 0.0051 m.
-_PER_SI = {"mm": 1e3, "mm3": 1e9}
+_PER_SI = {"mm": 1e3, "mm3": 1e9, "degrees": 180 / math.pi}
 
 
 class _Key(NamedTuple):
@@ -76,8 +76,9 @@ class Labels:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Block:
-    """Geometry: a block with one corner in the origin."""
+    """Geometry: a block of equal hexahedra."""
 
+    corner: tuple[float, float, float] = key("its corner of least x, y, z", (0.0, 0.0, 0.0), "mm")
     size: tuple[float, float, float] = key("edges along x, y, z", unit="mm", limits="(0, inf)")
     elements: tuple[int, int, int] = key("hexahedra along x, y, z", limits="[1, inf)")
     cloud: Literal["none", "core", "all"] = key("what the cloud replaces: nothing, an inner block, everything", "none")
@@ -86,6 +87,30 @@ class Block:
 
 _Length = Literal["m", "cm", "mm"]
 _Stress = Literal["Pa", "kPa", "MPa", "GPa"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cylinder:
+    """Geometry: a cylinder along z that stands on z = 0, around the origin."""
+
+    radius: float = key("radius", unit="mm", limits="(0, inf)")
+    height: float = key("height", unit="mm", limits="(0, inf)")
+    element_size: float = key("edge of a hexahedron, in the mean", 5.0, "mm", "(0, inf)")
+    cloud: Literal["none", "core", "all"] = key("what the cloud replaces: nothing, the inner part, everything", "none")
+    core_share: float = key('share of radius and height that `cloud = "core"` replaces', 0.5, limits="(0, 1)")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ellipsoid:
+    """Geometry: an ellipsoid around the origin."""
+
+    semi_axes: tuple[float, float, float] = key("semi-axes along x, y, z", unit="mm", limits="(0, inf)")
+    element_size: float = key("edge of a hexahedron, in the mean", 5.0, "mm", "(0, inf)")
+    cloud: Literal["none", "core", "all"] = key("what the cloud replaces: nothing, the inner part, everything", "none")
+    core_share: float = key('share of the semi-axes that `cloud = "core"` replaces', 0.5, limits="(0, 1)")
+    cavity: Literal["fitted", "moved"] = key(
+        "seed without a cloud: shells around it, or one hexahedron whose nodes move (the paper)", "fitted"
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,6 +128,9 @@ class MeshFiles:
         "of `efg` are the integration cells",
         2,
         limits="[1, 16]",
+    )
+    surface_areas: Path | None = key(
+        "CSV of node, x, y, z: the outer surface's share of constant stress at nodes on the cloud's boundary", None
     )
     unit: _Length = key("unit of length of `fe`, and of the others unless they have one", "m")
     efg_unit: _Length | None = key("unit of length of `efg`", None)
@@ -195,17 +223,25 @@ class Displaced:
     nodes: str = key("name of a node set")
     displacement: tuple[float, ...] = key("displacement at full load, one for each direction", unit="mm")
     directions: tuple[_XYZ, ...] = key("directions that are prescribed; the others stay free", ("x", "y", "z"))
+    rotation: float = key("angle at full load, by which the nodes are turned as well", 0.0, "degrees", "[-360, 360]")
+    axis: _XYZ = key("direction of the rotation's axis", "z")
+    centre: tuple[float, float, float] = key("a point on the rotation's axis", (0.0, 0.0, 0.0), "mm")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Solver:
     """Explicit time integration."""
 
-    method: Literal["quasi-static"] = key("slow loading, with mass scaling where the step needs it", "quasi-static")
-    load_time: float = key("duration of the load", 2.0, "s", "(0, inf)")
+    method: Literal["quasi-static", "dynamic-relaxation", "dynamic"] = key(
+        "slow loading; damped steps to the static solution; or waves, with the true masses", "quasi-static"
+    )
+    load_time: float = key("quasi-static, dynamic: duration of the load", 2.0, "s", "(0, inf)")
+    hold_time: float = key("quasi-static, dynamic: duration after it, at full load", 0.0, "s", "[0, inf)")
+    load_steps: int = key("dynamic-relaxation: steps in which the load grows", 500, limits="[1, inf)")
+    tolerance: float = key("dynamic-relaxation ends this near to the static solution", 0.01, "mm", "(0, inf)")
     time_step: Literal["auto"] | float = key("time step; auto: from the stability bound", "auto", "s", "(0, inf)")
     safety: float = key("share of the stability bound that the step takes", 0.8, limits="(0, 1]")
-    mass_scaling: bool = key("raise the mass of cells that the step is too long for", True)
+    mass_scaling: bool = key("quasi-static: raise the mass of nodes that the step is too long for", True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -224,11 +260,13 @@ class Partition:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Deck:
-    """A scene in SI units. Exactly one of `labels`, `block` and `mesh` is there."""
+    """A scene in SI units. Exactly one of the geometries is there."""
 
     title: str = key("what the scene is, in a few words", "")
     labels: Labels | None = None
     block: Block | None = None
+    cylinder: Cylinder | None = None
+    ellipsoid: Ellipsoid | None = None
     mesh: MeshFiles | None = None
     tumour: Tumour | None = None
     cloud: Cloud = field(default_factory=Cloud)
@@ -247,7 +285,9 @@ class Deck:
         for i, held in enumerate(self.fixed):
             yield Constraint(held.nodes, _axes(held), (0.0,) * len(held.directions), f"{self.path}: fixed.{i}.nodes")
         for i, moved in enumerate(self.displaced):
-            yield Constraint(moved.nodes, _axes(moved), moved.displacement, f"{self.path}: displaced.{i}.nodes")
+            turn = Rotation(moved.rotation, "xyz".index(moved.axis), moved.centre)
+            origin = f"{self.path}: displaced.{i}.nodes"
+            yield Constraint(moved.nodes, _axes(moved), moved.displacement, origin, turn if turn.angle else None)
 
 
 def _axes(section: Fixed | Displaced) -> tuple[int, ...]:
@@ -278,8 +318,10 @@ class _Source(NamedTuple):
     overridden: frozenset[str]
 
     def error(self, name: str, what: str, value: Any = MISSING) -> InputError:
-        where = "--set" if name in self.overridden else self.path
-        return InputError(f"{where}: {name}{'' if value is MISSING else f' = {_show(value)}'}: {what}")
+        # An override of a part, or of the section around it, is to blame too.
+        overridden = any(f"{name}.".startswith(f"{o}.") or o.startswith(f"{name}.") for o in self.overridden)
+        shown = "" if value is MISSING else f" = {_show(value)}"
+        return InputError(_line(f"{'--set' if overridden else self.path}: {name}{shown}: {what}"))
 
 
 def _parse(path: Path) -> dict[str, Any]:
@@ -303,13 +345,14 @@ def _syntax(text: str, error: Exception) -> str:
     message, line = str(error), re.search(r"line (\d+)", str(error))
     if not line:
         return f"{message}; correct the TOML"
-    shown = _shorten(text.splitlines()[int(line[1]) - 1].strip())
+    shown = _shorten(_line(text.split("\n")[int(line[1]) - 1].strip()))
     return f"line {line[1]}: {message[: line.start()].rstrip(' (at')}: {shown}; correct the TOML"
 
 
 def _override(table: dict[str, Any], text: str) -> str:
     """Enter "section.key=value" into the table of the deck; the key's name."""
     name, equals, value = (part.strip() for part in text.partition("="))
+    text = _line(text)
     steps = name.split(".")
     if not equals or not all(steps):
         raise InputError(f"--set {text}: is not section.key=value; write for example --set tumour.volume=523.6")
@@ -528,6 +571,11 @@ def _show(value: Any) -> str:
     return f"{value:.10g}" if isinstance(value, float) else _shorten(str(value))
 
 
+def _line(text: str) -> str:
+    """Names and overrides can hold line breaks, messages must not."""
+    return " ".join(text.splitlines())
+
+
 def _shorten(text: str) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
@@ -535,12 +583,16 @@ def _shorten(text: str) -> str:
 # --- what keys ask of each other -----------------------------------------------------------------------------------
 
 
+GEOMETRIES = ("labels", "block", "cylinder", "ellipsoid", "mesh")
+_OFFERED = "[labels], [block], [cylinder], [ellipsoid] and [mesh]"
+
+
 def _check(deck: Deck, source: _Source) -> None:
     given = canonical(deck)
-    geometries = [name for name in ("labels", "block", "mesh") if name in given]
+    geometries = [name for name in GEOMETRIES if name in given]
     if len(geometries) != 1:
         found = f"has {' and '.join(f'[{name}]' for name in geometries) or 'no geometry'}"
-        raise InputError(f"{deck.path}: {found}; give exactly one of [labels], [block] and [mesh]")
+        raise InputError(f"{deck.path}: {found}; give exactly one of {_OFFERED}")
     if not deck.materials and not deck.mesh:
         raise InputError(f"{deck.path}: has no material; give at least one [material.NAME] with youngs_modulus")
     owner: dict[str, str] = {}
@@ -567,6 +619,9 @@ def _check(deck: Deck, source: _Source) -> None:
         if len(moved.displacement) != len(moved.directions):
             what = f"has not one number for each of {_show(moved.directions)}; give {len(moved.directions)}, in mm"
             raise source.error(f"displaced.{i}.displacement", what, given["displaced"][i]["displacement"])
+        if moved.rotation and set("xyz") - {moved.axis} - set(moved.directions):
+            what = f"turns nodes about {moved.axis} that are free in a direction across it; prescribe that too"
+            raise source.error(f"displaced.{i}.directions", what, moved.directions)
     step = deck.solver.time_step
     if step != "auto" and step > deck.solver.load_time:
         what = f"is longer than solver.load_time; give less than {deck.solver.load_time:g} s"
@@ -582,8 +637,9 @@ def _check_tumour(deck: Deck, given: dict[str, Any], source: _Source) -> None:
     if deck.cloud.radius <= deck.tumour.seed_radius and not deck.mesh:
         what = f"lies within the seed; give more than tumour.seed_radius = {given['tumour']['seed_radius']:g} mm"
         raise source.error("cloud.radius", what, given["cloud"]["radius"])
-    if deck.block and deck.block.cloud == "none":
-        raise source.error("block.cloud", 'leaves a tumour no cloud to grow in; give "core" or "all"', "none")
+    for name, shape in (("block", deck.block), ("cylinder", deck.cylinder)):
+        if shape and shape.cloud == "none":
+            raise source.error(f"{name}.cloud", 'leaves a tumour no cloud to grow in; give "core" or "all"', "none")
 
 
 # --- what others make of the deck ----------------------------------------------------------------------------------
@@ -611,7 +667,7 @@ def canonical(deck: Deck) -> dict[str, Any]:
     return plain(deck)
 
 
-_MODEL = ("labels", "block", "mesh", "tumour", "cloud", "support", "hexahedra", "materials", "fixed", "displaced")
+_MODEL = (*GEOMETRIES, "tumour", "cloud", "support", "hexahedra", "materials", "fixed", "displaced")
 
 
 def model_key(deck: Deck, included: Sequence[Path] = ()) -> str:

@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled import store
+from mpitled.deck import GEOMETRIES
 from mpitled.errors import InputError
 from mpitled.meshfile import LARGEST_ID
 from mpitled.model import Model
 
-FE, EFG, GRID, SCENE = "fe.inp", "efg.inp", "integration_points.csv", "scene.toml"
-_GEOMETRIES = ("labels", "block", "mesh", "cloud")
+FE, EFG, GRID, AREAS, SCENE = "fe.inp", "efg.inp", "integration_points.csv", "surface_areas.csv", "scene.toml"
 #: Sections that the export writes anew: constraints are in the files, and materials go by sets that there are.
 _IN_FILES = ("material", "fixed", "displaced")
 _ROW = 16  # numbers in a line of a set
@@ -42,6 +42,8 @@ def write_abaqus(path: Path, directory: Path) -> list[Path]:
     if len(model.domains):
         contents[EFG] = _efg(model, ids)
         contents[GRID] = _grid(model)
+        if model.surface_areas is not None:
+            contents[AREAS] = _areas(model.surface_areas, ids)
     contents[SCENE] = _scene(model, scene, list(contents))
     written = []
     try:
@@ -164,31 +166,45 @@ def _all_sets(
 
 
 def _boundary(model: Model, ids: NDArray[np.int64], first: int, stop: int) -> Iterator[str]:
-    """What is held, as model data, and what is moved, as a step: by sets where a whole set is alike, else by nodes."""
+    """What is held, as model data, and what is moved, as a step: by sets where whole sets are, else by nodes."""
     value = np.full((model.n_nodes, 3), np.nan)
     value.ravel()[model.prescribed_dofs] = model.prescribed_displacements
     value[:first] = np.nan
     value[stop:] = np.nan
     held: list[str] = []
     moved: list[str] = []
+    singly: list[list[str]] = []  # of each set whose nodes move differently, so that it is read as that set again
     for name, members in sorted(model.node_sets.items(), key=lambda item: -len(item[1])):
         own = members[(members >= first) & (members < stop)]
+        rows = []
         for direction in range(3) if len(own) else ():
-            values = value[own, direction]
-            if np.isnan(values).any() or (values != values[0]).any():
+            values = value[own, direction].copy()
+            if np.isnan(values).any():
                 continue
-            where = f"{_quoted(name)}, {direction + 1}, {direction + 1}"
-            (held if values[0] == 0 else moved).append(f"{where}, {values[0].item()!r}\n")
+            if (values == values[0]).all():
+                line = f"{_quoted(name)}, {direction + 1}, {direction + 1}"
+                (held if values[0] == 0 else moved).append(f"{line}, {values[0].item()!r}\n")
+            else:
+                rows += _by_node(ids[own], direction, values)
             value[own, direction] = np.nan
-    nodes, directions = np.nonzero(~np.isnan(value))
-    for node, direction, at in zip(
-        ids[nodes].tolist(), (directions + 1).tolist(), value[nodes, directions].tolist(), strict=True
-    ):
-        (held if at == 0 else moved).append(f"{node}, {direction}, {direction}, {at!r}\n")
+        if rows:
+            singly.append(rows)
+    for direction in range(3):
+        left = np.flatnonzero(~np.isnan(value[:, direction]))
+        at = value[left, direction]
+        held += _by_node(ids[left[at == 0]], direction, at[at == 0])
+        moved += _by_node(ids[left[at != 0]], direction, at[at != 0])
     if held:
         yield "*BOUNDARY\n" + "".join(line.rpartition(", ")[0] + "\n" for line in held)
-    if moved:
-        yield "*STEP, NLGEOM=YES\n*STATIC\n*BOUNDARY\n" + "".join(moved) + "*END STEP\n"
+    if moved or singly:
+        yield "*STEP, NLGEOM=YES\n*STATIC\n"
+        yield from ("*BOUNDARY\n" + "".join(rows) for rows in (moved, *singly) if rows)
+        yield "*END STEP\n"
+
+
+def _by_node(ids: NDArray[np.int64], direction: int, values: NDArray[np.float64]) -> list[str]:
+    degree = direction + 1
+    return [f"{n}, {degree}, {degree}, {at!r}\n" for n, at in zip(ids.tolist(), values.tolist(), strict=True)]
 
 
 def _grid(model: Model) -> Iterator[str]:
@@ -204,6 +220,13 @@ def _grid(model: Model) -> Iterator[str]:
         yield f"{x!r},{y!r},{z!r},{volume!r},{several[1:] or 'all'}\n"
 
 
+def _areas(areas: NDArray[np.float64], ids: NDArray[np.int64]) -> Iterator[str]:
+    yield "node,x,y,z\n"
+    there = np.flatnonzero((areas != 0).any(axis=1))
+    for number, (x, y, z) in zip(ids[there].tolist(), areas[there].tolist(), strict=True):
+        yield f"{number},{x!r},{y!r},{z!r}\n"
+
+
 def _quoted(name: str) -> str:
     """A name as Abaqus has it: in quotation marks if it is more than letters, digits and underscores."""
     return name if re.fullmatch(r"[A-Za-z_]\w*", name, re.ASCII) else f'"{name}"'
@@ -214,17 +237,21 @@ def _quoted(name: str) -> str:
 
 def _scene(model: Model, scene: dict[str, Any], files: Sequence[str]) -> Iterator[str]:
     """The deck that the model was built from, with these files in place of its geometry."""
-    yield "# Written by mpitled export. Fixed and displaced nodes are in the files of [mesh].\n"
+    yield "# Written by mpitled export. Fixed and displaced nodes are in the files of [mesh]; rotations are here too.\n"
     yield from (f"{key} = {_toml(value)}\n" for key, value in scene.items() if not isinstance(value, dict | list))
     yield "\n[mesh]\n"
-    for key, name in (("fe", FE), ("efg", EFG), ("integration_points", GRID)):
+    for key, name in (("fe", FE), ("efg", EFG), ("integration_points", GRID), ("surface_areas", AREAS)):
         if name in files:
             yield f"{key} = {_toml(name)}\n"
     yield 'unit = "m"\nmerge_tolerance = 0.0\n'
     for section, table in scene.items():
-        if isinstance(table, dict) and section not in (*_GEOMETRIES, *_IN_FILES):
+        if isinstance(table, dict) and section not in (*GEOMETRIES, "cloud", *_IN_FILES):
             yield f"\n[{section}]\n"
             yield from (f"{key} = {_toml(value)}\n" for key, value in table.items())
+    for entry in scene.get("displaced", ()):
+        if entry["rotation"]:  # the files know where it ends, not that it goes there along an arc
+            yield "\n[[displaced]]\n"
+            yield from (f"{key} = {_toml(value)}\n" for key, value in entry.items())
     used: set[str] = set()
     for i, material in enumerate(model.materials):
         name = material.name

@@ -19,6 +19,8 @@ MOST_INCLUDES = 1000
 
 @dataclass(slots=True)
 class Keyword:
+    """A keyword line with its parameters, and the data below it."""
+
     name: str  # in capitals, without blanks
     shown: str  # with its asterisk, as messages have it
     parameters: dict[str, str]  # names in capitals, without blanks

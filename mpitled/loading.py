@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mpitled.mesh import Rotation
+
 
 def loading_curve(share: float) -> float:
     """Share of the full load at the share t/T of the load time (paper, eq. 4.1): rest at both ends."""
@@ -22,3 +24,16 @@ def growth(
 ) -> NDArray[np.float64]:
     """Displacement (n, 3), m at full load, of nodes on the seed's surface: radially, to the sphere of that volume."""
     return (sphere_radius(volume) / seed_radius - 1) * (points - centre)
+
+
+def turn(points: NDArray[np.float64], rotation: Rotation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Displacements (n, 3), m at full load, of points (n, 3) that are turned, and (n, 3, 3) how they get there.
+
+    The last axis of the latter is, for each direction, the angle phi in rad, the arm r from the axis and e x r, both in
+    m: at the share d of the load the displacement is (cos(d phi) - 1) r + sin(d phi) e x r.
+    """
+    arm = points - np.asarray(rotation.centre)
+    arm[:, rotation.axis] = 0.0
+    across = np.cross(np.eye(3)[rotation.axis], arm)
+    turns = np.stack([np.full_like(arm, rotation.angle), arm, across], axis=2)
+    return (np.cos(rotation.angle) - 1) * arm + np.sin(rotation.angle) * across, turns

@@ -15,6 +15,15 @@ CORNERS = np.array([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1,
 
 
 @dataclass(frozen=True, slots=True)
+class Rotation:
+    """A rotation about an axis parallel to x, y or z."""
+
+    angle: float  # rad, at full load; right-handed
+    axis: int  # 0, 1, 2
+    centre: tuple[float, float, float]  # a point on the axis, m
+
+
+@dataclass(frozen=True, slots=True)
 class Constraint:
     """Nodes held (displacement 0) or moved along the loading curve, in the named directions only."""
 
@@ -23,6 +32,7 @@ class Constraint:
     #: m at full load, one for each direction, 0 where fixed; or (n_nodes,) where the set's nodes move differently
     displacement: tuple[float | NDArray[np.float64], ...]
     origin: str = ""  # file and line or key, for messages
+    rotation: Rotation | None = None  # beside the displacement
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +50,8 @@ class Mesh:
     node_sets: dict[str, NDArray[np.int64]]  # name -> ascending nodes
     cell_sets: dict[str, NDArray[np.int64]]  # name -> ascending cells
     node_ids: NDArray[np.int64]  # (n_nodes,), numbers in the file that the nodes came from
+    # (n_nodes, 3), m^2: integral of N_a n over the outer surface, at nodes on the cloud's boundary; None: unknown.
+    surface_areas: NDArray[np.float64] | None = None
     materials: dict[str, Material] = field(default_factory=dict)  # cell set -> material, where the file says so
     constraints: tuple[Constraint, ...] = ()  # where the file says so
     remarks: tuple[str, ...] = ()  # what the reader skipped, merged or repaired, a line each
@@ -52,6 +64,39 @@ class Mesh:
     @property
     def n_cells(self) -> int:
         return len(self.hexahedra) + len(self.integration_points)
+
+
+def hexahedral_mesh(
+    points: NDArray[np.float64], hexahedra: NDArray[np.int64], node_sets: dict[str, NDArray[np.int64]]
+) -> Mesh:
+    """A mesh of hexahedra only."""
+    return numbered_mesh(points, len(points), hexahedra, np.empty((0, 3)), np.empty(0), node_sets, {})
+
+
+def numbered_mesh(
+    points: NDArray[np.float64],
+    n_fe_nodes: int,
+    hexahedra: NDArray[np.int64],
+    integration_points: NDArray[np.float64],
+    integration_volumes: NDArray[np.float64],
+    node_sets: dict[str, NDArray[np.int64]],
+    figures: dict[str, float],
+    surface_areas: NDArray[np.float64] | None = None,
+) -> Mesh:
+    """A mesh that comes from no file: nodes count from 1, cell sets are all, hexahedra and cloud."""
+    cells = np.arange(len(hexahedra) + len(integration_points))
+    return Mesh(
+        points=points,
+        n_fe_nodes=n_fe_nodes,
+        hexahedra=hexahedra,
+        integration_points=integration_points,
+        integration_volumes=integration_volumes,
+        node_sets=node_sets,
+        cell_sets={"all": cells, "hexahedra": cells[: len(hexahedra)], "cloud": cells[len(hexahedra) :]},
+        node_ids=np.arange(1, len(points) + 1),
+        surface_areas=surface_areas,
+        figures=figures,
+    )
 
 
 def structured_hexahedra(shape: tuple[int, int, int]) -> NDArray[np.int64]:

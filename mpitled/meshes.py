@@ -69,9 +69,9 @@ def read_file(path: Path) -> MeshFile:
 
 
 def files(section: deck.MeshFiles) -> list[Path]:
-    """The files of a deck's section with all that they include: the mesh depends on their contents."""
+    """The meshes of a deck's section with all that they include: the model depends on their contents."""
     found = [_reader(path)[1](path) for path in (section.fe, section.efg) if path]
-    return [path for several in found for path in several] + [p for p in [section.integration_points] if p]
+    return [path for several in found for path in several]
 
 
 def _reader(path: Path) -> tuple[Callable[[Path], MeshFile], Callable[[Path], list[Path]]]:
@@ -106,6 +106,8 @@ def _read_with_meshio(path: Path) -> MeshFile:
         reason = " ".join((str(error) if not isinstance(error, SystemExit) else said.getvalue()).split())[:100]
         raise InputError(f"{path}: cannot be read by meshio ({reason or type(error).__name__}); correct it") from None
     points = np.asarray(mesh.points, float)
+    if points.ndim != 2 or not 1 < points.shape[1] < 4:
+        raise InputError(f"{path}: has nodes that are no places in space; correct it")
     points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
     file = MeshFile(path, f"meshio ({path.suffix})", points, np.arange(1, len(points) + 1))
     first = 0
@@ -406,7 +408,7 @@ def assemble(section: deck.MeshFiles, fe: MeshFile, efg: MeshFile | None, seed_v
         remarks.append(
             f"{efg.path}: {len(interface)} nodes merged with FE nodes, {np.count_nonzero(new)} EFG nodes added"
         )
-    elif section.integration_points or section.dropped:
+    elif section.integration_points or section.dropped or section.surface_areas:
         raise InputError("mesh.efg: is missing; integration points and dropped hexahedra need the nodes of a cloud")
     if len(repeated := checks.coincident(points, section.merge_tolerance)):
         remarks.append(
@@ -431,6 +433,7 @@ def assemble(section: deck.MeshFiles, fe: MeshFile, efg: MeshFile | None, seed_v
         node_sets=node_sets,
         cell_sets=cell_sets,
         node_ids=ids,
+        surface_areas=_surface_areas(section.surface_areas, metre, ids) if section.surface_areas else None,
         materials=materials,
         constraints=tuple(_constraints(parts, node_sets, remarks)),
         remarks=tuple(dict.fromkeys(remarks)),
@@ -739,6 +742,42 @@ def read_grid(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], dic
     return points, volumes, sets
 
 
+def _surface_areas(path: Path, metre: float, ids: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Areas (n_nodes, 3), m^2, of a table of node, x, y, z; 0 where it has no line."""
+    rows, first = _read_table(path, ("node", "x", "y", "z"))
+    numbering = meshfile.Numbering(ids)
+    if (np.diff(numbering.ids) == 0).any():
+        raise InputError(f"{path}: some nodes of the FE and the EFG file have the same number; renumber those of one")
+    at, found = numbering.rows(meshfile.as_ids(rows[:, 0], "node", str(path)))
+    if not found.all():
+        line = first + int(np.argmax(~found))
+        raise InputError(f"{path}: line {line}: there is no such node ({np.count_nonzero(~found)} such); correct it")
+    areas = np.zeros((len(ids), 3))
+    areas[at] = rows[:, 1:] * metre**2
+    return areas
+
+
+def _read_table(path: Path, names: tuple[str, ...]) -> tuple[NDArray[np.float64], int]:
+    """Numbers (n, len(names)) of a CSV file, which may begin with these names, and the line of the first."""
+    text = meshfile.read_text(path, f"a table of {', '.join(names)} (CSV)")
+    end = text.find(b"\n") + 1 or len(text)
+    header = [name.strip().casefold() for name in meshfile.decoded(text[:end]).split(",")]
+    named = header == list(names)
+    block = meshfile.Block(path, 1 + named, text, end if named else 0, len(text))
+    return _rows_of(block, len(names), ", ".join(names)), 1 + named
+
+
+def _rows_of(block: meshfile.Block, width: int, names: str) -> NDArray[np.float64]:
+    values, counts = meshfile.separated(block, float, b"#")
+    if (counts != width).any():
+        row = int(np.argmax(counts != width))
+        raise InputError(
+            f"{block.path}: line {block.line + row}: has {counts[row]} numbers; give {names} "
+            f"({np.count_nonzero(counts != width)} such)"
+        )
+    return values.reshape(-1, width)
+
+
 def _read_csv(
     path: Path,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], dict[str, NDArray[np.int64]], int]:
@@ -752,14 +791,7 @@ def _read_csv(
     names: list[str] = []
     if (named and len(header) > 4) or (not named and len(header) > 4):
         block, names = _split_sets(block)
-    values, counts = meshfile.separated(block, float, b"#")
-    if (counts != 4).any():
-        row = int(np.argmax(counts != 4))
-        raise InputError(
-            f"{path}: line {1 + named + row}: has {counts[row]} numbers; give x, y, z, volume "
-            f"({np.count_nonzero(counts != 4)} such)"
-        )
-    rows = values.reshape(-1, 4)
+    rows = _rows_of(block, 4, "x, y, z, volume")
     sets: dict[str, NDArray[np.int64]] = {}
     if names:
         groups, group = np.unique(np.array(names), return_inverse=True)

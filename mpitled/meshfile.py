@@ -141,6 +141,7 @@ class Block:
 
 
 def where(path: Path, line: int) -> str:
+    """File and line, as messages begin."""
     return f"{path}: line {line}"
 
 

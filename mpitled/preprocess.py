@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import block, checks, hexahedra, labels, support
+from mpitled import block, checks, hexahedra, labels, phantoms, support
 from mpitled.deck import Deck
 from mpitled.errors import InputError
-from mpitled.loading import growth
+from mpitled.loading import growth, turn
 from mpitled.material import Material
 from mpitled.mesh import Mesh, named_set
 from mpitled.model import Model
@@ -27,7 +27,11 @@ def read_mesh(deck: Deck) -> Mesh:
         return labels.mesh_labels(deck.labels, deck.cloud, deck.tumour)
     if deck.block:
         return block.block_mesh(deck.block, deck.cloud, deck.tumour)
-    assert deck.mesh is not None  # load_deck sees to one of the three
+    if deck.cylinder:
+        return phantoms.cylinder_mesh(deck.cylinder, deck.cloud, deck.tumour)
+    if deck.ellipsoid:
+        return phantoms.ellipsoid_mesh(deck.ellipsoid, deck.cloud, deck.tumour)
+    assert deck.mesh is not None  # load_deck sees to exactly one geometry
     from mpitled import meshes
 
     seed_volume = 4 / 3 * np.pi * deck.tumour.seed_radius**3 if deck.tumour else 0.0
@@ -46,26 +50,22 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
     at, volumes, n_hexahedra = mesh.integration_points, mesh.integration_volumes, len(mesh.hexahedra)
     limits, wanted = _limits(deck, mesh)
     found = support.find_domains(mesh.points, at, options.nodes, limits, wanted, options.min_domains)
-    domains = found.domains
-    repaired = support.repair(mesh.points, at, domains, options.basis, options.weight, limits)
-    # Repairs may take the last domain from a node. FE nodes have their hexahedra.
-    in_domains = np.bincount(domains.ravel(), minlength=mesh.n_nodes) > 0
-    orphans = mesh.n_fe_nodes + np.flatnonzero(~in_domains[mesh.n_fe_nodes :])
-    mesh, domains = _without(orphans, mesh, domains)
+    repaired = support.repair(mesh.points, at, found.domains, options.basis, options.weight, limits)
+    # Only now: repair can take a node from its last domain. FE nodes stay, for they have mass from hexahedra.
+    orphans = np.setdiff1d(np.arange(mesh.n_fe_nodes, mesh.n_nodes), found.domains)
+    mesh, domains = _without(orphans, mesh, found.domains)
     n_fe_nodes, points = mesh.n_fe_nodes, mesh.points
     shapes, gradients, condition = support.moving_least_squares(points[domains], at, options.basis, options.weight)
     field_domains, field_shapes = support.field_at_nodes(points, n_fe_nodes, at, domains, options.basis, options.weight)
-    dofs, displacements = prescribe(deck, mesh)
+    dofs, displacements, turns = prescribe(deck, mesh)
 
     fe_gradients, fe_volumes = hexahedra.geometry(points, mesh.hexahedra, deck.hexahedra.gradient)
     figures = dict(mesh.figures)
     if options.consistency and len(domains):
-        free = np.zeros(len(points), bool)
-        free[domains] = True
-        for name in OUTER:
-            free[mesh.node_sets.get(name, [])] = False
-        free[dofs // 3] = False
-        balance = support.nodal_sum(mesh.hexahedra, fe_volumes[:, None, None] * fe_gradients, len(points))
+        balance = hexahedra.nodal_sum(mesh.hexahedra, fe_volumes[:, None, None] * fe_gradients, len(points))
+        free, surface = _surface(mesh, balance, dofs // 3)
+        free &= np.bincount(domains.ravel(), minlength=len(points)) > 0
+        balance = balance - surface
         gradients, corrected = support.correct_consistency(points[domains], domains, gradients, volumes, balance, free)
         figures |= corrected
 
@@ -80,9 +80,12 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
     each = np.concatenate([8 * stiffness[:n_hexahedra], options.nodes * stiffness[n_hexahedra:]])
     critical = 2 * np.sqrt(mass / _shared(mesh.hexahedra, domains, each, len(points)))
     loose = np.setdiff1d(np.arange(len(points)), dofs // 3)
+    critical = critical[loose] if len(loose) else critical
+    # Next to a seed the cloud is fine: a few heavier nodes there cost less than its short step everywhere.
+    in_cloud = np.isin(loose, domains) if len(loose) else np.zeros(len(points), bool)
     figures |= {
-        "critical_step_min_s": float(critical[loose].min()) if len(loose) else float(critical.min()),
-        "critical_step_median_s": float(np.median(critical[loose])) if len(loose) else float(critical.min()),
+        "critical_step_min_s": float(critical.min()),
+        "critical_step_typical_s": float(np.median(critical if in_cloud.all() else critical[~in_cloud])),
         "mass_kg": float(cell_mass.sum()),
         "volume_m3": float(fe_volumes.sum() + volumes.sum()),
         "domains_limited": found.limited,
@@ -108,8 +111,10 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
         mass=mass,
         prescribed_dofs=dofs,
         prescribed_displacements=displacements,
+        prescribed_turns=turns,
         node_sets=mesh.node_sets,
         cell_sets=mesh.cell_sets,
+        surface_areas=mesh.surface_areas,
         figures=figures,
         remarks=(*mesh.remarks, *checks.scene_remarks(points, mesh.hexahedra, domains, n_fe_nodes, dofs)),
     )
@@ -124,10 +129,39 @@ def _limits(deck: Deck, mesh: Mesh) -> tuple[list[support.Limit], NDArray[np.boo
     """
     fe = np.arange(mesh.n_nodes) < mesh.n_fe_nodes
     seed = np.zeros(mesh.n_nodes, bool)
-    seed[mesh.node_sets.get(TUMOUR, [])] = True
+    seed[_members(mesh, TUMOUR)] = True
     wanted = ~fe
-    wanted[mesh.node_sets.get("interface", [])] = True
+    wanted[_members(mesh, "interface")] = True
     return [(fe, deck.support.max_fe_nodes), (seed, deck.support.nodes // 2)], wanted
+
+
+def _surface(
+    mesh: Mesh, fe_balance: NDArray[np.float64], prescribed: NDArray[np.int64]
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Nodes at which the surface's share of a constant stress is known, and that share (n_nodes, 3), m^2.
+
+    It is what hexahedra alone leave (fe_balance) at nodes that have all of theirs, and nothing inside the cloud. On the
+    cloud's boundary the mesher knows it; where a file does not say, nodes that are outer or prescribed are left out.
+    The seed's surface is curved between its nodes: its share is only known roughly.
+    """
+    known = np.ones(mesh.n_nodes, bool)
+    whole = np.arange(mesh.n_nodes) < mesh.n_fe_nodes
+    whole[_members(mesh, "interface")] = False
+    surface = np.where(whole[:, None], fe_balance, 0.0)
+    if mesh.surface_areas is not None:
+        surface[~whole] = mesh.surface_areas[~whole]
+    else:
+        known[prescribed] = False
+        for name in OUTER:
+            known[_members(mesh, name)] = False
+        known |= whole
+    known[_members(mesh, TUMOUR)] = False
+    return known, surface
+
+
+def _members(mesh: Mesh, name: str) -> NDArray[np.int64]:
+    """Nodes of a set; none if there is no such set."""
+    return mesh.node_sets.get(name, np.empty(0, np.int64))
 
 
 def _shared(
@@ -199,22 +233,27 @@ def _without(orphans: NDArray[np.int64], mesh: Mesh, domains: NDArray[np.int64])
         node_ids=mesh.node_ids[keep],
         node_sets=sets,
         constraints=tuple(constraints),
+        surface_areas=None if mesh.surface_areas is None else mesh.surface_areas[keep],
         remarks=(*mesh.remarks, remark),
     )
     return kept, number[domains]
 
 
-def prescribe(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Prescribed dofs (3 node + direction, ascending) and their displacements (m) at full load.
+def prescribe(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Prescribed dofs (3 node + direction, ascending), their displacements (m) at full load, and their turns (n, 3).
 
     InputError if a dof is asked to be in two places, or nothing at all is prescribed.
     """
-    dofs, values, origins = [], [], []
+    dofs, values, turns, origins = [], [], [], []
     for constraint in (*deck.constraints(), *mesh.constraints):
         nodes = named_set(mesh.node_sets, constraint.node_set, constraint.origin)
+        turned, arcs = np.zeros((len(nodes), 3)), np.zeros((len(nodes), 3, 3))
+        if constraint.rotation:
+            turned, arcs = turn(mesh.points[nodes], constraint.rotation)
         for direction, displacement in zip(constraint.directions, constraint.displacement, strict=True):
             dofs.append(3 * nodes + direction)
-            values.append(np.broadcast_to(displacement, len(nodes)))
+            values.append(displacement + turned[:, direction])
+            turns.append(arcs[:, direction])
             origins.append(constraint.origin)
     if deck.tumour:
         origin = f"{deck.path}: tumour"
@@ -222,12 +261,13 @@ def prescribe(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.flo
         moved = growth(mesh.points[nodes], np.array(deck.tumour.centre), deck.tumour.seed_radius, deck.tumour.volume)
         dofs.append((3 * nodes[:, None] + np.arange(3)).ravel())
         values.append(moved.ravel())
+        turns.append(np.zeros((moved.size, 3)))
         origins.append(origin)
     if not dofs:
         raise InputError(f"{deck.path}: nothing is fixed, displaced or grows; add [[fixed]], [[displaced]] or [tumour]")
     every, at, source = np.concatenate(dofs), np.concatenate(values), np.repeat(np.arange(len(dofs)), [*map(len, dofs)])
     order = np.lexsort((at, every))
-    every, at, source = every[order], at[order], source[order]
+    every, at, source, turning = every[order], at[order], source[order], np.concatenate(turns)[order]
     clash = np.flatnonzero((np.diff(every) == 0) & (np.diff(at) != 0))
     if len(clash):
         first = clash[0]
@@ -238,4 +278,4 @@ def prescribe(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.flo
             f"take it out of one of the two ({len(clash)} such)"
         )
     keep = np.append(True, np.diff(every) > 0)
-    return every[keep], at[keep]
+    return every[keep], at[keep], turning[keep]

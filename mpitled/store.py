@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from partition import PartTables
 
 #: Written into every model; a file of another layout is built anew, never read by guess.
-MODEL_LAYOUT = 1
+MODEL_LAYOUT = 2
 
 #: A file of results of another layout is refused too.
 RESULT_LAYOUT = 1
@@ -50,10 +50,12 @@ _MODEL_ARRAYS = {
     "mass": np.float64,
     "prescribed_dofs": np.int64,
     "prescribed_displacements": np.float64,
+    "prescribed_turns": np.float64,
 }
 
 
 def hdf5_version() -> str:
+    """Version of the HDF5 library that h5py was built on."""
     return str(h5py.version.hdf5_version)
 
 
@@ -79,6 +81,8 @@ def write_model(path: Path, model: Model, key: str, scene: Mapping[str, Any] | N
         file.attrs["n_fe_nodes"] = model.n_fe_nodes
         for name, dtype in _MODEL_ARRAYS.items():
             file.create_dataset(name, data=np.asarray(getattr(model, name), dtype))
+        if model.surface_areas is not None:
+            file["surface_areas"] = model.surface_areas
         for name in ("node_sets", "cell_sets"):
             _write_sets(file.create_group(name), getattr(model, name))
         _write_json(file, "materials", [asdict(material) for material in model.materials])
@@ -95,6 +99,7 @@ def read_model(path: Path) -> Model:
             n_fe_nodes=int(file.attrs["n_fe_nodes"]),
             node_sets=_read_sets(file["node_sets"]),
             cell_sets=_read_sets(file["cell_sets"]),
+            surface_areas=file["surface_areas"][...] if "surface_areas" in file else None,
             materials=_read_materials(file),
             figures=_read_json(file, "figures"),
             remarks=tuple(_read_json(file, "remarks")),
@@ -322,6 +327,7 @@ class PartRows:
     materials: tuple[Material, ...]
     prescribed_dofs: NDArray[np.int64]  # ascending 3 node + direction, on `nodes`
     prescribed_displacements: NDArray[np.float64]  # m
+    prescribed_turns: NDArray[np.float64]  # (len(prescribed_dofs), 3)
     field_nodes: NDArray[np.int64]  # ascending EFG nodes whose field one of `domains` gives; not all in `nodes`
     field_domains: NDArray[np.int64]  # the support domain of each, a number of the whole model
     field_shapes: NDArray[np.float64]  # (len(field_nodes), n)
@@ -384,6 +390,7 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
             materials=_read_materials(file),
             prescribed_dofs=dofs,
             prescribed_displacements=read_rows(file["prescribed_displacements"], prescribed),
+            prescribed_turns=read_rows(file["prescribed_turns"], prescribed),
             field_nodes=n_fe_nodes + fields_here,
             field_domains=field_domains,
             field_shapes=read_rows(file["field_shapes"], fields_here),
@@ -775,6 +782,12 @@ def _ascending(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
     """Rows of the numbers from 0 on, in their order; -1 is no number."""
     rows = np.flatnonzero(numbers >= 0)
     return rows[np.argsort(numbers[rows])]
+
+
+def is_result(path: Path) -> bool:
+    """Whether the HDF5 file is a result of ours, of whatever layout; InputError if it is no HDF5 file."""
+    with _open(path) as file:
+        return "mpitled" in file and "VTKHDF" in file
 
 
 def open_result(path: Path) -> Result:

@@ -78,6 +78,7 @@ class Subdomain:
     fixed: NDArray[np.uint32]  # dofs (3 node + direction) that stay where they are
     moving: NDArray[np.uint32]  # dofs that follow the loading curve
     moving_full: NDArray[np.float64]  # (len(moving),), m at full load
+    moving_turns: NDArray[np.float64] | None  # (len(moving), 3), see `loading.turn`; None where all move straight
     shared: tuple[tuple[int, NDArray[np.uint32]], ...]  # (rank, nodes shared with it), ranks ascending
 
     @property
@@ -106,7 +107,8 @@ def localise(rows: PartRows, hourglass: float, stabilisation: float, rule: str) 
     in_runs = np.repeat(np.diff(breaks) >= SHORTEST_RUN, np.diff(breaks)) & box
     general = np.flatnonzero(~in_runs)
     dofs = 3 * local(rows.prescribed_dofs // 3) + (rows.prescribed_dofs % 3).astype(np.uint32)
-    moves = rows.prescribed_displacements != 0
+    turns = rows.prescribed_turns.any(axis=1)
+    moves = (rows.prescribed_displacements != 0) | turns
     return Subdomain(
         rows=rows,
         n_nodes=len(rows.nodes),
@@ -117,6 +119,7 @@ def localise(rows: PartRows, hourglass: float, stabilisation: float, rule: str) 
         fixed=dofs[~moves],
         moving=dofs[moves],
         moving_full=rows.prescribed_displacements[moves],
+        moving_turns=rows.prescribed_turns[moves] if turns.any() else None,
         shared=tuple(
             (int(rank), local(rows.shared[first:last]))
             for rank, first, last in zip(

@@ -44,8 +44,10 @@ cells = ["cloud"]
 nodes = "x0"
 [[displaced]]
 nodes = "x1"
-directions = ["x", "z"]
-displacement = [0.7, -0.3]
+displacement = [0.7, 0.0, -0.3]
+rotation = 3.0
+axis = "x"
+centre = [0.0, 20.0, 20.0]
 [solver]
 load_time = 0.1
 [output]
@@ -343,17 +345,20 @@ def test_what_meshio_cannot_read_is_one_line(tmp_path):
 
 
 def test_an_exported_model_runs_to_the_same_bits(tmp_path):
-    """Block, core cloud, tumour, fixed and displaced sets, two materials: from decks as from the block itself."""
+    """Block, core cloud, tumour, fixed, displaced and turned sets, two materials: from decks as from the block."""
     (tmp_path / "scene.toml").write_text(GROWTH)
     mpitled("run", tmp_path / "scene.toml", "--out", tmp_path / "a")
     printed = mpitled("export", tmp_path / "a", "--abaqus", "--out", tmp_path / "decks").stdout.split()
-    assert [Path(name).name for name in printed] == ["fe.inp", "efg.inp", "integration_points.csv", "scene.toml"]
+    assert [Path(name).name for name in printed] == [
+        "fe.inp", "efg.inp", "integration_points.csv", "surface_areas.csv", "scene.toml",
+    ]  # fmt: skip
     mpitled("run", tmp_path / "decks" / "scene.toml", "--out", tmp_path / "b")
     models = [store.read_model(tmp_path / x / "model.h5") for x in "ab"]
     for name in store._MODEL_ARRAYS:
         one, other = (getattr(model, name) for model in models)
         assert one.tobytes() == other.tobytes(), name
     assert models[0].materials == models[1].materials
+    assert models[0].surface_areas.tobytes() == models[1].surface_areas.tobytes()
     for kind in ("node_sets", "cell_sets"):
         one, other = (getattr(model, kind) for model in models)
         assert one.keys() == other.keys()

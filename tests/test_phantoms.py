@@ -1,0 +1,217 @@
+"""Cylinders and ellipsoids: exact surfaces, sets, volumes that converge, good cells, and balance of constant stress."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+from mpitled import deck, hexahedra, kernels, loading, preprocess, support
+from mpitled.cloud import boundary_faces
+from mpitled.errors import InputError
+from mpitled.mesh import Rotation
+from mpitled.phantoms import cylinder_mesh, ellipsoid_mesh
+
+CLOUD = deck.Cloud()
+TUMOUR = deck.Tumour(centre=(0.015, 0.0, 0.008), volume=523.6e-9)
+#: Its surface has as few nodes as the ellipsoid's.
+COARSE_SEED = deck.Tumour(centre=(0.015, 0.0, 0.008), volume=523.6e-9, surface_nodes=12)
+RADIUS, HEIGHT, AXES = 0.05, 0.1, np.array([0.08, 0.065, 0.06])
+SEED_VOLUME = 4 / 3 * np.pi * 0.002**3
+MATERIAL = "[material.brain]\nyoungs_modulus = 3000.0\npoissons_ratio = 0.49\n"
+ROUND_OFF = 1e-14  # of coordinates of 0.1 m, and of their squares over the semi-axes'
+
+
+def cylinder(size=0.01, tumour=None, **keys):
+    return cylinder_mesh(deck.Cylinder(radius=RADIUS, height=HEIGHT, element_size=size, **keys), CLOUD, tumour)
+
+
+def ellipsoid(size=0.008, tumour=None, axes=AXES, **keys):
+    return ellipsoid_mesh(deck.Ellipsoid(semi_axes=tuple(axes), element_size=size, **keys), CLOUD, tumour)
+
+
+def fe_volume(mesh):
+    return hexahedra.volumes(mesh.points, mesh.hexahedra).sum()
+
+
+@pytest.mark.parametrize(
+    ("mesher", "sizes", "exact"),
+    [
+        (cylinder, (0.01, 0.005), np.pi * RADIUS**2 * HEIGHT),
+        (ellipsoid, (0.008, 0.004), 4 / 3 * np.pi * AXES.prod()),
+        (lambda size: ellipsoid(size, COARSE_SEED), (0.008, 0.004), 4 / 3 * np.pi * AXES.prod() - SEED_VOLUME),
+    ],
+    ids=["cylinder", "ellipsoid", "cavity"],
+)
+def test_volumes_converge_at_second_order(mesher, sizes, exact):
+    """The sizes are such that all numbers of elements double: a quarter of the error, and terms of fourth order."""
+    coarse, fine = (mesher(size) for size in sizes)
+    assert len(fine.node_sets["surface"]) - 2 == pytest.approx(4 * (len(coarse.node_sets["surface"]) - 2), rel=0.1)
+    errors = [1 - fe_volume(mesh) / exact for mesh in (coarse, fine)]
+    assert 0 < errors[1] < errors[0] < 0.03
+    assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
+
+
+def test_cylinder_has_its_nodes_on_its_surface():
+    mesh = cylinder()
+    r, z = np.hypot(*mesh.points[:, :2].T), mesh.points[:, 2]
+    bottom, top, side = (mesh.node_sets[name] for name in ("bottom", "top", "side"))
+    np.testing.assert_array_equal(bottom, np.flatnonzero(z == 0))
+    np.testing.assert_array_equal(top, np.flatnonzero(z == HEIGHT))
+    np.testing.assert_array_equal(side, np.flatnonzero(np.abs(r - RADIUS) < ROUND_OFF))
+    assert r.max() < RADIUS + ROUND_OFF
+    np.testing.assert_array_equal(mesh.node_sets["surface"], np.unique(boundary_faces(mesh.hexahedra)))
+    np.testing.assert_array_equal(mesh.node_sets["surface"], np.unique(np.concatenate([bottom, top, side])))
+
+
+@pytest.mark.parametrize("tumour", [None, TUMOUR], ids=["whole", "cavity"])
+def test_ellipsoid_has_its_nodes_on_its_surface(tumour):
+    """patch and fixed by the mesher's formulas; their edges are at nodes, so that a tolerance changes nothing."""
+    mesh = ellipsoid(tumour=tumour)
+    p, q, r = (mesh.points / AXES).T
+    surface = np.flatnonzero(np.abs(p * p + q * q + r * r - 1) < ROUND_OFF)
+    np.testing.assert_array_equal(mesh.node_sets["surface"], surface)
+    across, slope = np.maximum(np.abs(p), np.abs(q))[surface], np.tan(np.pi / 8)
+    for tolerance in (1e-12, 1e-3):
+        patch = surface[(across <= slope * r[surface] + tolerance) & (r[surface] > 0)]
+        fixed = surface[(across <= -r[surface] + tolerance) & (r[surface] < 0)]
+        np.testing.assert_array_equal(mesh.node_sets["patch"], patch)
+        np.testing.assert_array_equal(mesh.node_sets["fixed"], fixed)
+    boundary = np.unique(boundary_faces(mesh.hexahedra))
+    if tumour:
+        seed = mesh.node_sets["tumour"]
+        assert np.abs(np.linalg.norm(mesh.points[seed] - TUMOUR.centre, axis=1) - 0.002).max() < ROUND_OFF
+        assert len(seed) >= TUMOUR.surface_nodes
+        surface = np.union1d(surface, seed)
+    np.testing.assert_array_equal(boundary, surface)
+
+
+@pytest.mark.parametrize("size", [0.02, 0.012, 0.008, 0.005])
+def test_no_corner_is_poor(size):
+    """Scaled Jacobians: 0.5 in the shapes of the validation, 0.3 in an ellipsoid as flat as a lens."""
+    lens, cigar = ellipsoid(size, axes=[0.08, 0.08, 0.03]), ellipsoid(size, axes=[0.08, 0.04, 0.04])
+    for mesh in (lens, cigar):
+        assert hexahedra.scaled_jacobian(mesh.points, mesh.hexahedra).min() > 0.3
+    for mesh in (cylinder(size), ellipsoid(size), ellipsoid(size, TUMOUR), ellipsoid(size, axes=[0.06] * 3)):
+        assert hexahedra.scaled_jacobian(mesh.points, mesh.hexahedra).min() > 0.5
+
+
+@pytest.mark.parametrize("size", [0.008, 0.005, 0.003])
+def test_elements_have_the_size_asked_for(size):
+    """In the mean within 10 %; edges of the smallest and the largest cell differ by less than a factor of 2."""
+    for mesh in (cylinder(size), ellipsoid(size)):
+        edges = np.cbrt(hexahedra.volumes(mesh.points, mesh.hexahedra))
+        assert np.cbrt((edges**3).mean()) == pytest.approx(size, rel=0.1)
+        assert edges.max() < 2 * edges.min()
+
+
+@pytest.mark.parametrize("tumour", [None, TUMOUR], ids=["whole", "tumour"])
+@pytest.mark.parametrize("cloud", ["core", "all"])
+def test_cloud_takes_the_place_of_hexahedra(cloud, tumour):
+    for mesher in (cylinder, ellipsoid):
+        seed = tumour and deck.Tumour(centre=(0.005, 0.0, 0.05 if mesher is cylinder else 0.008), volume=523.6e-9)
+        whole, mesh = mesher(0.007), mesher(0.007, cloud=cloud, tumour=seed)
+        missing = SEED_VOLUME if seed else 0.0
+        volume = mesh.integration_volumes.sum() + (fe_volume(mesh) if len(mesh.hexahedra) else 0.0)
+        assert volume == pytest.approx(fe_volume(whole) - missing, rel=1e-12)
+        assert (mesh.n_fe_nodes > 0) == (cloud == "core")
+        assert (len(mesh.node_sets["interface"]) > 0) == (cloud == "core")
+        for name, nodes in whole.node_sets.items():
+            places = {tuple(place) for place in mesh.points[mesh.node_sets[name]]}
+            assert places == {tuple(place) for place in whole.points[nodes]}
+
+
+def test_core_ends_at_its_share_of_the_radius():
+    """The square core alone at a share of 0.5; with more, also rings, but never the outermost."""
+    for share, reach in ((0.5, 0.5), (0.7, 0.7), (0.999, 0.8)):
+        mesh = cylinder(0.005, cloud="core", core_share=share)
+        places = mesh.points[mesh.node_sets["interface"]]
+        r = np.hypot(*places[:, :2].T).max() / RADIUS
+        assert r == pytest.approx(reach, abs=0.13)
+        assert r < 0.95
+        margin = max(round((1 - share) / 2 * 20), 1) * 0.005
+        assert (places[:, 2].min(), places[:, 2].max()) == pytest.approx((margin, HEIGHT - margin))
+
+
+@pytest.mark.parametrize("shape", ["cylinder", "ellipsoid"])
+@pytest.mark.parametrize("cloud", ["none", "core"])
+def test_constant_stress_is_in_balance_at_inner_nodes(tmp_path, shape, cloud):
+    """The patch test: gradients of affine fields are exact in every cell, and their forces vanish inside."""
+    geometry = {
+        "cylinder": "[cylinder]\nradius = 50\nheight = 100\nelement_size = 12.0\n",
+        "ellipsoid": "[ellipsoid]\nsemi_axes = [80, 65, 60]\nelement_size = 12.0\n",
+    }[shape]
+    path = tmp_path / "scene.toml"
+    path.write_text(f'{geometry}cloud = "{cloud}"\n{MATERIAL}[[fixed]]\nnodes = "surface"\n')
+    model = preprocess.build(deck.load_deck(path))
+    B, V = hexahedra.geometry(model.points, model.hexahedra)
+    if cloud == "core":
+        assert len(model.domains) > 0
+    for cells, gradients in ((model.hexahedra, B), (model.domains, model.domain_gradients)):
+        slopes = np.einsum("nai,naj->nij", model.points[cells], gradients)
+        # Round-off, times the root of the worst condition of a moment matrix that is accepted.
+        assert np.abs(slopes - np.eye(3)).max(initial=0) < 1e-12
+    forces = support.nodal_sum(model.hexahedra, V[:, None, None] * B, model.n_nodes)
+    if cloud == "core":
+        of_cloud = model.domain_volumes[:, None, None] * model.domain_gradients
+        forces += support.nodal_sum(model.domains, of_cloud, model.n_nodes)
+    inner = np.setdiff1d(np.arange(model.n_nodes), model.node_sets["surface"])
+    assert np.abs(forces[inner]).max() < 1e-11 * np.abs(forces).max()
+
+
+def test_a_hexahedron_is_the_seed_of_the_papers_mesh():
+    """It has its middle in the tumour's centre, the surface is where it was, and no other node has come too near."""
+    whole, mesh = ellipsoid(), ellipsoid(tumour=TUMOUR, cavity="moved")
+    seed = mesh.points[mesh.node_sets["tumour"]]
+    assert len(mesh.hexahedra) == len(whole.hexahedra) - 1
+    assert seed.shape == (8, 3)
+    assert np.abs(seed.mean(axis=0) - TUMOUR.centre).max() < ROUND_OFF
+    surface = mesh.node_sets["surface"]
+    assert np.abs(mesh.points[surface] - whole.points[surface]).max() < ROUND_OFF
+    assert hexahedra.scaled_jacobian(mesh.points, mesh.hexahedra).min() > 0.4
+
+
+def test_a_seed_needs_room():
+    with pytest.raises(InputError, match=r"tumour.centre = \(75, 0, 8\) mm: seed and an element's size"):
+        ellipsoid(tumour=deck.Tumour(centre=(0.075, 0.0, 0.008), volume=523.6e-9))
+    with pytest.raises(InputError, match=r'cylinder.cloud = "none"'):
+        cylinder(tumour=TUMOUR)
+
+
+@pytest.mark.parametrize("degrees", [90.0, 180.0])
+def test_turned_nodes_keep_to_their_arcs(degrees):
+    """At any share of the load a turned node is as far from the axis as ever, at that share of the angle."""
+    rng = np.random.default_rng(0)
+    points, centre = rng.uniform(-1, 1, (50, 3)), np.array([0.3, -0.2, 0.9])
+    for axis in range(3):
+        rotation = Rotation(np.radians(degrees), axis, tuple(centre))
+        full, turns = loading.turn(points, rotation)
+        path, share = np.empty(full.size), 0.37
+        kernels.follow(path, full.ravel(), turns.reshape(-1, 3), share)
+        across = [(axis + 1) % 3, (axis + 2) % 3]
+        before, after = ((p - centre)[:, across] @ [1, 1j] for p in (points, points + path.reshape(-1, 3)))
+        np.testing.assert_allclose(after, before * np.exp(1j * share * rotation.angle), atol=1e-14)
+        kernels.follow(path, full.ravel(), turns.reshape(-1, 3), 1.0)
+        np.testing.assert_allclose(path, full.ravel(), rtol=0, atol=1e-15)
+
+
+def test_rotation_in_the_deck(tmp_path):
+    """Degrees and millimetres, beside a displacement; a direction across the axis must not be free."""
+    path = tmp_path / "scene.toml"
+    text = "[block]\ncorner = [-10, -10, 0]\nsize = [20, 20, 40]\nelements = [2, 2, 4]\n" + MATERIAL
+    text += '[[fixed]]\nnodes = "z0"\n[[displaced]]\nnodes = "z1"\ndisplacement = [0, 0, 4]\nrotation = 90\n'
+    path.write_text(text)
+    model = preprocess.build(deck.load_deck(path))
+    top = model.node_sets["z1"]
+    u = np.zeros(3 * model.n_nodes)
+    u[model.prescribed_dofs] = model.prescribed_displacements
+    x, y, z = model.points[top].T
+    np.testing.assert_allclose(u.reshape(-1, 3)[top], np.stack([-y - x, x - y, np.full_like(z, 0.004)], 1), atol=1e-17)
+    path.write_text(text.replace("[0, 0, 4]", '[0, 4]\ndirections = ["x", "z"]'))
+    with pytest.raises(InputError, match=r"displaced.0.directions = .*turns nodes about z"):
+        deck.load_deck(path)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "jobs" / "validation").glob("*.toml")), ids=lambda path: path.stem)
+def test_validation_decks_are_read(path):
+    assert deck.load_deck(path).title
