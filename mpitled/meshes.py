@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mpitled import abaqus, checks, hexahedra, lsdyna, meshfile, store
+from mpitled import abaqus, checks, hexahedra, lsdyna, meshfile, tables
 from mpitled.cloud import subdivide, volumes_and_centroids
 from mpitled.errors import InputError
 from mpitled.material import Material
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 #: kg/m^3 of a material whose file gives no density.
 DENSITY = 1000.0
-#: Coordinates are smaller, in the file's unit: volumes and their products must stay floats.
-FARTHEST = 1e12
 #: Integration volumes that miss the void's by more than this share are warned about.
 FILLED = 0.01
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
@@ -60,10 +58,10 @@ def read_file(path: Path) -> MeshFile:
     """What a mesh file of any kind says. InputError if it is none, or wrong."""
     with np.errstate(over="ignore", invalid="ignore"):  # of what is refused right away
         file = _reader(path)[0](path)
-    bad = np.flatnonzero(~(np.abs(file.points) < FARTHEST).all(axis=1))
+    bad = np.flatnonzero(~(np.abs(file.points) < meshfile.FARTHEST).all(axis=1))
     if len(bad):
         raise InputError(
-            f"{path}: node {file.node_ids[bad[0]]} has a coordinate beyond {FARTHEST:g} ({len(bad)} such); correct it"
+            f"{path}: node {file.node_ids[bad[0]]} has a coordinate beyond {meshfile.FARTHEST:g} ({len(bad)} such)"
         )
     return file
 
@@ -435,7 +433,7 @@ def assemble(section: deck.MeshFiles, fe: MeshFile, efg: MeshFile | None, seed_v
         node_sets=node_sets,
         cell_sets=cell_sets,
         node_ids=ids,
-        surface_areas=_surface_areas(section.surface_areas, metre, ids) if section.surface_areas else None,
+        surface_areas=tables.read_areas(section.surface_areas, metre, ids) if section.surface_areas else None,
         materials=materials,
         constraints=tuple(_constraints(parts, node_sets, remarks)),
         remarks=tuple(dict.fromkeys(remarks)),
@@ -511,7 +509,7 @@ def _integration(
     own, own_rows = _solid_corners(efg, efg_points)
     void = dropped if len(dropped) else own
     if section.integration_points:
-        points, volumes, sets = read_grid(section.integration_points)
+        points, volumes, sets = tables.read_grid(section.integration_points)
         metre = _METRES[section.integration_unit or section.unit]
         return _Cloud(points * metre, volumes * metre**3, sets), void
     if len(dropped):
@@ -716,104 +714,3 @@ def _alike(parts: list[_Part], given: Constraint) -> bool:
         )
         for part in owners
     )
-
-
-# --- integration points --------------------------------------------------------------------------------------------
-
-
-def read_grid(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], dict[str, NDArray[np.int64]]]:
-    """Places (n, 3), volumes (n,) and sets of integration points, in the file's units, from CSV or HDF5.
-
-    CSV has a line for each point: x, y, z, volume and, if the points are in sets, their names with semicolons
-    between them. A line of column names may come first. InputError if a volume is not positive.
-    """
-    if path.suffix.lower() in (".h5", ".hdf5", ".hdf"):
-        points, volumes = store.read_grid(path)
-        sets: dict[str, NDArray[np.int64]] = {}
-        first = None
-    else:
-        points, volumes, sets, first = _read_csv(path)
-    if not len(points):
-        raise InputError(f"{path}: has no integration points; give lines of x, y, z, volume")
-    bad = np.flatnonzero(~((volumes > 0) & (volumes < FARTHEST**3) & (np.abs(points) < FARTHEST).all(axis=1)))
-    if len(bad):
-        where = f"line {first + bad[0]}" if first is not None else f"row {bad[0] + 1}"
-        raise InputError(
-            f"{path}: {where}: an integration point needs finite x, y, z and a positive volume ({len(bad)} such)"
-        )
-    return points, volumes, sets
-
-
-def _surface_areas(path: Path, metre: float, ids: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Areas (n_nodes, 3), m^2, of a table of node, x, y, z; 0 where it has no line."""
-    rows, first = _read_table(path, ("node", "x", "y", "z"))
-    numbering = meshfile.Numbering(ids)
-    if (np.diff(numbering.ids) == 0).any():
-        raise InputError(f"{path}: some nodes of the FE and the EFG file have the same number; renumber those of one")
-    at, found = numbering.rows(meshfile.as_ids(rows[:, 0], "node", str(path)))
-    if not found.all():
-        line = first + int(np.argmax(~found))
-        raise InputError(f"{path}: line {line}: there is no such node ({np.count_nonzero(~found)} such); correct it")
-    areas = np.zeros((len(ids), 3))
-    areas[at] = rows[:, 1:] * metre**2
-    return areas
-
-
-def _read_table(path: Path, names: tuple[str, ...]) -> tuple[NDArray[np.float64], int]:
-    """Numbers (n, len(names)) of a CSV file, which may begin with these names, and the line of the first."""
-    text = meshfile.read_text(path, f"a table of {', '.join(names)} (CSV)")
-    end = text.find(b"\n") + 1 or len(text)
-    header = [name.strip().casefold() for name in meshfile.decoded(text[:end]).split(",")]
-    named = header == list(names)
-    block = meshfile.Block(path, 1 + named, text, end if named else 0, len(text))
-    return _rows_of(block, len(names), ", ".join(names)), 1 + named
-
-
-def _rows_of(block: meshfile.Block, width: int, names: str) -> NDArray[np.float64]:
-    values, counts = meshfile.separated(block, float, b"#")
-    if (counts != width).any():
-        row = int(np.argmax(counts != width))
-        raise InputError(
-            f"{block.path}: line {block.line + row}: has {counts[row]} numbers; give {names} "
-            f"({np.count_nonzero(counts != width)} such)"
-        )
-    return values.reshape(-1, width)
-
-
-def _read_csv(
-    path: Path,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], dict[str, NDArray[np.int64]], int]:
-    text = meshfile.read_text(path, "a table of integration points (CSV)")
-    end = text.find(b"\n") + 1 or len(text)
-    header = [name.strip().strip('"').casefold() for name in meshfile.decoded(text[:end]).strip().split(",")]
-    start, named = (end, True) if any(name[:1].isalpha() for name in header) else (0, False)
-    if named and (header[:4] not in (["x", "y", "z", "volume"], ["x", "y", "z", "v"]) or len(header) > 5):
-        raise InputError(f"{path}: line 1: the columns are {', '.join(header)[:60]}; give x, y, z, volume and sets")
-    block = meshfile.Block(path, 1 + named, text, start, len(text))
-    names: list[str] = []
-    if (named and len(header) > 4) or (not named and len(header) > 4):
-        block, names = _split_sets(block)
-    rows = _rows_of(block, 4, "x, y, z, volume")
-    sets: dict[str, NDArray[np.int64]] = {}
-    if names:
-        groups, group = np.unique(np.array(names), return_inverse=True)
-        for i, several in enumerate(groups.tolist()):
-            members = np.flatnonzero(group == i)
-            for name in filter(None, (part.strip() for part in several.split(";"))):
-                sets[name] = np.union1d(sets[name], members) if name in sets else members
-    return rows[:, :3].copy(), rows[:, 3].copy(), sets, 1 + named
-
-
-def _split_sets(block: meshfile.Block) -> tuple[meshfile.Block, list[str]]:
-    """The numbers without the last column, and that column."""
-    numbers, names = [], []
-    for line, text in block.lines("#"):
-        fields = text.split(",", 4)
-        if len(fields) < 4:
-            raise InputError(
-                f"{meshfile.where(block.path, line)}: has {len(fields)} fields; give x, y, z, volume, sets"
-            )
-        numbers.append(",".join(fields[:4]))
-        names.append(fields[4].strip().strip('"') if len(fields) > 4 else "")
-    rows = "\n".join(numbers).encode()
-    return meshfile.Block(block.path, block.line, rows, 0, len(rows)), names

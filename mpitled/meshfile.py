@@ -17,6 +17,8 @@ from mpitled.mesh import Constraint
 
 #: Larger numbers of nodes and elements are slips: programs that write decks keep them in 32 bits.
 LARGEST_ID = 2**31 - 1
+#: Coordinates are smaller, in the file's unit: volumes and their products must stay floats.
+FARTHEST = 1e12
 #: Corners of the solids that can be read; all other elements are of kind "other".
 SOLIDS = {"hexahedron": 8, "wedge": 6, "pyramid": 5, "tetrahedron": 4}
 

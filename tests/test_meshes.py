@@ -15,7 +15,7 @@ from conftest import complaint, mpitled
 from decks import CLOUD, FLAT, void_decks
 from fuzz import fuzz
 
-from mpitled import hexahedra, meshes, overview, store
+from mpitled import hexahedra, meshes, overview, store, tables
 from mpitled.deck import MeshFiles, load_deck
 from mpitled.errors import InputError
 from mpitled.mesh import Mesh, grid_points, structured_hexahedra
@@ -161,13 +161,13 @@ def test_grids_in_hdf5_and_with_sets(void):
     x, y, z, volume = np.loadtxt(void / "grid.csv", delimiter=",", skiprows=1).T
     with h5py.File(void / "grid.h5", "w") as file:
         file.update({"x": x, "y": y, "z": z, "volume": volume})
-    same = meshes.read_grid(void / "grid.h5")
-    table = meshes.read_grid(void / "grid.csv")
+    same = tables.read_grid(void / "grid.h5")
+    table = tables.read_grid(void / "grid.csv")
     assert (same[0].tobytes(), same[1].tobytes()) == (table[0].tobytes(), table[1].tobytes())
     lines = (void / "grid.csv").read_text().splitlines()
     lines = ["x,y,z,volume,sets", lines[1] + ",a;b b", lines[2] + ",", lines[3] + ",a", *(x + ",c" for x in lines[4:])]
     (void / "grid.csv").write_text("\n".join(lines))
-    sets = meshes.read_grid(void / "grid.csv")[2]
+    sets = tables.read_grid(void / "grid.csv")[2]
     assert sets["a"].tolist() == [0, 2]
     assert sets["b b"].tolist() == [0]
     mesh = meshes.read_mesh(load_deck(void / "scene.toml").mesh)
@@ -179,7 +179,7 @@ def test_an_hdf5_file_that_claims_too_much_is_refused(void):
         for name in ("x", "y", "z", "volume"):
             file.create_dataset(name, (10**12,), "f8", chunks=(1024,))
     with pytest.raises(InputError, match="claims 1000000000000 points"):
-        meshes.read_grid(void / "grid.h5")
+        tables.read_grid(void / "grid.h5")
 
 
 def test_constraints_and_materials_of_the_files_count_with_those_of_the_deck(void):
