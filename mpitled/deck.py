@@ -85,6 +85,10 @@ class Block:
     core_share: float = key('share of each edge that `cloud = "core"` replaces', 0.5, limits="(0, 1)")
 
 
+_Length = Literal["m", "cm", "mm"]
+_Stress = Literal["Pa", "kPa", "MPa", "GPa"]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cylinder:
     """Geometry: a cylinder along z that stands on z = 0, around the origin."""
@@ -113,10 +117,31 @@ class Ellipsoid:
 class MeshFiles:
     """Geometry: meshes made by other programs."""
 
-    fe: Path = key("nodes, hexahedra and sets; relative to the deck's folder")
-    efg: Path | None = key("nodes of the cloud", None)
-    integration_points: Path | None = key("integration points x, y, z, volume", None)
-    unit: Literal["m", "cm", "mm"] = key("unit of length in these files", "m")
+    fe: Path | None = key(
+        "nodes, hexahedra and sets (Abaqus, LS-DYNA, or what meshio reads); from the deck's folder", None
+    )
+    efg: Path | None = key("nodes of the cloud; those on the interface may be repeated", None)
+    integration_points: Path | None = key("CSV or HDF5 with x, y, z, volume, and sets if need be", None)
+    dropped: tuple[str, ...] = key("cell sets of `fe` whose hexahedra the cloud replaces", ())
+    cuts: int = key(
+        "without `integration_points`: parts of a dropped hexahedron along each edge; if none is dropped, the cells "
+        "of `efg` are the integration cells",
+        2,
+        limits="[1, 16]",
+    )
+    surface_areas: Path | None = key(
+        "CSV of node, x, y, z: the outer surface's share of constant stress at nodes on the cloud's boundary", None
+    )
+    unit: _Length = key("unit of length of `fe`, and of the others unless they have one", "m")
+    efg_unit: _Length | None = key("unit of length of `efg`", None)
+    integration_unit: _Length | None = key("unit of length of `integration_points`", None)
+    stress_unit: _Stress = key("unit of stress of `fe`, and of `efg` unless it has one", "Pa")
+    efg_stress_unit: _Stress | None = key("unit of stress of `efg`", None)
+    density_unit: Literal["consistent", "kg/m3", "g/cm3", "kg/mm3", "t/mm3"] = key(
+        "unit of density of both; consistent: that goes with length, stress and seconds, as t/mm3 with mm and MPa",
+        "consistent",
+    )
+    repair: bool = key("put the nodes of hexahedra in order that are numbered inside out or crosswise", False)
     merge_tolerance: float = key("nodes of both meshes closer than this are one", 0.001, "mm", "[0, inf)")
 
 
@@ -558,13 +583,13 @@ def _shorten(text: str) -> str:
 # --- what keys ask of each other -----------------------------------------------------------------------------------
 
 
-_GEOMETRIES = ("labels", "block", "cylinder", "ellipsoid", "mesh")
+GEOMETRIES = ("labels", "block", "cylinder", "ellipsoid", "mesh")
 _OFFERED = "[labels], [block], [cylinder], [ellipsoid] and [mesh]"
 
 
 def _check(deck: Deck, source: _Source) -> None:
     given = canonical(deck)
-    geometries = [name for name in _GEOMETRIES if name in given]
+    geometries = [name for name in GEOMETRIES if name in given]
     if len(geometries) != 1:
         found = f"has {' and '.join(f'[{name}]' for name in geometries) or 'no geometry'}"
         raise InputError(f"{deck.path}: {found}; give exactly one of {_OFFERED}")
@@ -642,13 +667,19 @@ def canonical(deck: Deck) -> dict[str, Any]:
     return plain(deck)
 
 
-_MODEL = (*_GEOMETRIES, "tumour", "cloud", "support", "hexahedra", "materials", "fixed", "displaced")
+_MODEL = (*GEOMETRIES, "tumour", "cloud", "support", "hexahedra", "materials", "fixed", "displaced")
 
 
-def model_key(deck: Deck) -> str:
-    """What determines the model, as canonical JSON: values in SI units, and files by the SHA-256 of their contents."""
+def model_key(deck: Deck, included: Sequence[Path] = ()) -> str:
+    """What determines the model, as canonical JSON: values in SI units, and files by the SHA-256 of their contents.
+
+    `included` are files that those of the deck read in turn.
+    """
     sections = asdict(deck)
-    return json.dumps({name: sections[name] for name in _MODEL}, sort_keys=True, separators=(",", ":"), default=_digest)
+    content: dict[str, Any] = {name: sections[name] for name in _MODEL}
+    if included:
+        content["included"] = list(included)
+    return json.dumps(content, sort_keys=True, separators=(",", ":"), default=_digest)
 
 
 def _digest(path: Path) -> str:

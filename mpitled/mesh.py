@@ -29,7 +29,8 @@ class Constraint:
 
     node_set: str
     directions: tuple[int, ...]  # of 0, 1, 2
-    displacement: tuple[float, ...]  # m at full load, one for each direction; 0 where fixed
+    #: m at full load, one for each direction, 0 where fixed; or (n_nodes,) where the set's nodes move differently
+    displacement: tuple[float | NDArray[np.float64], ...]
     origin: str = ""  # file and line or key, for messages
     rotation: Rotation | None = None  # beside the displacement
 

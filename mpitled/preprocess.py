@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import block, hexahedra, labels, phantoms, support
+from mpitled import block, checks, hexahedra, labels, phantoms, support
 from mpitled.deck import Deck
 from mpitled.errors import InputError
 from mpitled.loading import growth, turn
@@ -32,14 +32,20 @@ def read_mesh(deck: Deck) -> Mesh:
     if deck.ellipsoid:
         return phantoms.ellipsoid_mesh(deck.ellipsoid, deck.cloud, deck.tumour)
     assert deck.mesh is not None  # load_deck sees to exactly one geometry
-    from mpitled import reader
+    from mpitled import meshes
 
-    return reader.read_mesh(deck.mesh)
+    seed_volume = 4 / 3 * np.pi * deck.tumour.seed_radius**3 if deck.tumour else 0.0
+    return meshes.read_mesh(deck.mesh, seed_volume)
 
 
 def build(deck: Deck) -> Model:
     """The model of a deck. InputError if the mesh and the deck do not fit each other."""
-    mesh, options = read_mesh(deck), deck.support
+    return discretise(deck, read_mesh(deck))
+
+
+def discretise(deck: Deck, mesh: Mesh) -> Model:
+    """The model of a deck whose mesh is read; see `build`."""
+    options = deck.support
     material, materials = _materials(deck, mesh)
     at, volumes, n_hexahedra = mesh.integration_points, mesh.integration_volumes, len(mesh.hexahedra)
     limits, wanted = _limits(deck, mesh)
@@ -108,8 +114,9 @@ def build(deck: Deck) -> Model:
         prescribed_turns=turns,
         node_sets=mesh.node_sets,
         cell_sets=mesh.cell_sets,
+        surface_areas=mesh.surface_areas,
         figures=figures,
-        remarks=mesh.remarks,
+        remarks=(*mesh.remarks, *checks.scene_remarks(points, mesh.hexahedra, domains, n_fe_nodes, dofs)),
     )
 
 
@@ -168,24 +175,33 @@ def _shared(
 def _materials(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int16], tuple[Material, ...]]:
     """Material of each cell, and the materials: those that the deck names first, then those of the mesh's own file.
 
-    "all" fills what no other set claims.
+    "all" fills what no other set of the deck claims; what the deck leaves over is of the file's materials.
     """
     claims = [(name, section.material) for section in deck.materials for name in section.cells]
-    claims += [(name, material) for name, material in mesh.materials.items() if not deck.materials]
-    materials = tuple(dict.fromkeys(material for _, material in claims))
+    of_file = list(mesh.materials.items())
+    if any(name == "all" for name, _ in claims):
+        of_file = []
+    materials = tuple(dict.fromkeys(material for _, material in (*claims, *of_file)))
     chosen = np.full(mesh.n_cells, -1, np.int16)
-    for name, material in sorted(claims, key=lambda claim: claim[0] == "all"):
-        origin = f"{deck.path}: material.{material.name}.cells"
+
+    def fill(name: str, material: Material, origin: str, open_cells: NDArray[np.bool_]) -> None:
         cells = np.arange(mesh.n_cells) if name == "all" else named_set(mesh.cell_sets, name, origin)
-        if name == "all":
-            cells = cells[chosen < 0]
-        elif (chosen[cells] >= 0).any():
+        cells = cells[open_cells[cells]]
+        taken = chosen[cells] >= 0
+        if taken.any():
             twice = materials[chosen[cells].max()].name
             raise InputError(
-                f"{origin}: {np.count_nonzero(chosen[cells] >= 0)} cells of '{name}' are of material '{twice}' "
-                "already; take them out of one of the two"
+                f"{origin}: {np.count_nonzero(taken)} cells of '{name}' are of material '{twice}' already; take them "
+                "out of one of the two"
             )
         chosen[cells] = materials.index(material)
+
+    for name, material in sorted(claims, key=lambda claim: claim[0] == "all"):
+        open_cells = chosen < 0 if name == "all" else np.ones(mesh.n_cells, bool)
+        fill(name, material, f"{deck.path}: material.{material.name}.cells", open_cells)
+    left = chosen < 0
+    for name, material in of_file:
+        fill(name, material, f"{deck.path}: mesh: section of material {material.name}", left)
     if (chosen < 0).any():
         cell = int(np.argmax(chosen < 0))
         sets = [name for name, members in mesh.cell_sets.items() if cell in members]
@@ -204,12 +220,19 @@ def _without(orphans: NDArray[np.int64], mesh: Mesh, domains: NDArray[np.int64])
     keep[orphans] = False
     number = np.cumsum(keep) - 1
     sets = {name: number[nodes[keep[nodes]]] for name, nodes in mesh.node_sets.items()}
+    constraints = []
+    for given in mesh.constraints:
+        there = keep[mesh.node_sets[given.node_set]]
+        values = tuple(v[there] if isinstance(v, np.ndarray) else v for v in given.displacement)
+        if there.any():
+            constraints.append(replace(given, displacement=values))
     remark = f"{len(orphans)} EFG nodes that are in no support domain removed"
     kept = replace(
         mesh,
         points=mesh.points[keep],
         node_ids=mesh.node_ids[keep],
         node_sets=sets,
+        constraints=tuple(constraints),
         surface_areas=None if mesh.surface_areas is None else mesh.surface_areas[keep],
         remarks=(*mesh.remarks, remark),
     )

@@ -55,13 +55,18 @@ class Phases:
 def build(deck: Deck, directory: Path) -> tuple[Path, bool]:
     """The model of a deck in directory/model.h5, and whether it had to be built: the same deck uses it again."""
     path = directory / MODEL
-    key = decks.model_key(deck)
+    included: list[Path] = []
+    if deck.mesh:
+        from mpitled import meshes
+
+        included = meshes.files(deck.mesh)
+    key = decks.model_key(deck, included)
     if store.model_key(path) == key:
         return path, False
     directory.mkdir(parents=True, exist_ok=True)
     from mpitled import preprocess  # only the rank that builds needs the meshers
 
-    store.write_model(path, preprocess.build(deck), key)
+    store.write_model(path, preprocess.build(deck), key, decks.canonical(deck))
     return path, True
 
 
