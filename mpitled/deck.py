@@ -459,7 +459,11 @@ def _value(hint: Any, value: Any, about: _Key, name: str, source: _Source) -> An
         raise source.error(name, f"{error}; give {_expected(hint, about)}{default}", value) from None
     if isinstance(converted, Path):
         converted = source.path.parent / converted
-        if not converted.is_file():
+        try:
+            there = converted.is_file()
+        except OSError:  # a name that is too long
+            there = False
+        if not there:
             raise source.error(name, f"there is no file {converted}; give a path relative to the deck's folder", value)
     return _si(converted, about.unit)
 

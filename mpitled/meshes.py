@@ -118,6 +118,8 @@ def _read_with_meshio(path: Path) -> MeshFile:
         if data.size and (data.min() < 0 or data.max() >= len(points)):
             raise InputError(f"{path}: a cell of type {block.type} has a node that the file does not define")
         kind = _MESHIO.get(block.type, "other")
+        if data.shape[1] < meshfile.SOLIDS.get(kind, 0):
+            raise InputError(f"{path}: cells of type {block.type} have {data.shape[1]} nodes; correct it")
         ids = first + 1 + np.arange(len(data))
         nodes = data[:, : meshfile.SOLIDS.get(kind)].astype(np.int64)
         file.cells.append(Cells(kind, block.type, ids, nodes, str(path)))
