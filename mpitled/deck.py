@@ -152,7 +152,7 @@ class Tumour:
     centre: tuple[float, float, float] = key("centre of seed and tumour, in the image's coordinates", unit="mm")
     volume: float = key("volume of the whole sphere at full load", unit="mm3", limits="(0, inf)")
     seed_radius: float = key("radius of the sphere at the start", 2.0, "mm", "(0, inf)")
-    surface_nodes: int = key("nodes on the seed's surface; fewer leave its hull short", 400, limits="[12, inf)")
+    surface_nodes: int = key("nodes on the seed's surface; fewer leave its hull short", 800, limits="[12, inf)")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -160,20 +160,20 @@ class Cloud:
     """EFG nodes and integration points in place of hexahedra."""
 
     radius: float = key("tissue hexahedra this near to the tumour's centre are replaced", 18.0, "mm", "(0, inf)")
-    growth: float = key("node spacing as a share of the distance to the seed's centre", 0.3, limits="(0, inf)")
+    growth: float = key("node spacing as a share of the distance to the seed's centre", 0.2, limits="(0, inf)")
     spacing: float = key("largest node spacing; 0: the size of a hexahedron", 0.0, "mm", "[0, inf)")
     irregularity: float = key("random shift of nodes as a share of the spacing", 0.3, limits="[0, 0.5)")
     seed: int = key("seed of the random numbers", 0, limits="[0, inf)")
-    points_per_spacing: float = key("integration cells per node spacing, in each direction", 1.4, limits="(0, inf)")
+    points_per_spacing: float = key("integration cells per node spacing, in each direction", 1.1, limits="(0, inf)")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Support:
     """Support domains of the integration points."""
 
-    nodes: int = key("nodes in a support domain, n", 8, limits="[4, inf)")
+    nodes: int = key("nodes in a support domain, n; the paper: 8", 12, limits="[4, inf)")
     basis: Literal[4, 10, 20] = key("monomials of the basis, m: linear, quadratic, cubic", 4)
-    weight: Literal["equal", "quartic"] = key("weight function of the moving least squares", "equal")
+    weight: Literal["equal", "quartic"] = key("weight of the moving least squares; the paper: equal", "quartic")
     max_fe_nodes: int = key("most FE nodes in a support domain", 7, limits="[0, inf)")
     min_domains: int = key("every EFG node is in at least so many support domains", 3, limits="[1, inf)")
     stabilisation: float = key(

@@ -19,6 +19,7 @@ PADDING = VOXEL_LANES  # a short run reads beyond its last node, and never write
 _ROUND = np.uint64(8)
 _VL = np.uint64(VOXEL_LANES)
 _BL = np.uint64(BATCH_LANES)
+_BLOCK = np.uint64(8)  # nodes of a support domain that are summed in registers
 # Fused multiply-adds and free association, but NaN and infinity stay what they are: the watch needs them.
 _FAST = {"contract", "nsz", "arcp", "reassoc"}
 _inline = njit(fastmath=_FAST, error_model="numpy", cache=True)
@@ -416,136 +417,124 @@ def hexahedron_survey(u, nodes, cells, geometry, coefficient, gram, stiffness, r
 # ---------------------------------------------------------------- support domains, gathered
 
 
-@_inline
-def _domain_modes(u, nodes, gradient, batch, ue, grad, members):  # type: ignore[no-untyped-def]
-    """Nodal displacements (3, n, lanes) and grad u (9, lanes) of a batch of support domains."""
-    n = U(len(members))
+@njit(fastmath=_FAST, error_model="numpy", inline="always")
+def _block_sums(ue, gradient, position, batch, c, w, first):  # type: ignore[no-untyped-def]
+    """Sums over a block of a domain's nodes, in one lane: u B_a (3), u and u X_a (3)."""
+    zero = ue.dtype.type(0)
+    gx = zero
+    gy = zero
+    gz = zero
+    s = zero
+    x = zero
+    y = zero
+    z = zero
+    for b in range(_BLOCK):
+        a = first + b
+        v = ue[3 * a + c, w]
+        gx += v * gradient[batch, 3 * a, w]
+        gy += v * gradient[batch, 3 * a + 1, w]
+        gz += v * gradient[batch, 3 * a + 2, w]
+        if position is not None:
+            s += v
+            x += v * position[batch, 3 * a, w]
+            y += v * position[batch, 3 * a + 1, w]
+            z += v * position[batch, 3 * a + 2, w]
+    return gx, gy, gz, s, x, y, z
+
+
+@njit(fastmath=_FAST, error_model="numpy", inline="always")
+def _domain_modes(u, nodes, gradient, position, inverse, batch, ue, grad, mode):  # type: ignore[no-untyped-def]
+    """Nodal displacements (3 n, lanes), grad u (9, lanes) and the affine part (12, lanes) of a batch of domains.
+
+    The affine part of u, by the unweighted linear projector of the domain's nodes, is for each component the mean and
+    the three slopes along the positions X from theirs: (X^T X)^-1 X^T u. Without position there is none. Blocks of
+    constant length are unrolled into sums in registers, which loops over all n nodes are not when n is large.
+    """
+    n = U(nodes.shape[1])
+    whole = n // _BLOCK * _BLOCK
     zero = u.dtype.type(0)
+    share = u.dtype.type(1) / u.dtype.type(nodes.shape[1])
     for a in range(n):
         for w in range(_BL):
             k = U(nodes[batch, a, w])
-            ue[0, a, w] = u[0, k]
-            ue[1, a, w] = u[1, k]
-            ue[2, a, w] = u[2, k]
+            ue[3 * a, w] = u[0, k]
+            ue[3 * a + 1, w] = u[1, k]
+            ue[3 * a + 2, w] = u[2, k]
+    if whole == 0:
+        grad[:] = zero
+        mode[:] = zero
     for c in range(U(3)):
-        for w in range(_BL):
-            x = zero
-            y = zero
-            z = zero
-            for a in range(n):
-                v = ue[c, a, w]
-                x += v * gradient[batch, 3 * a, w]
-                y += v * gradient[batch, 3 * a + 1, w]
-                z += v * gradient[batch, 3 * a + 2, w]
-            grad[3 * c, w] = x
-            grad[3 * c + 1, w] = y
-            grad[3 * c + 2, w] = z
+        if whole > 0:
+            for w in range(_BL):
+                b = _block_sums(ue, gradient, position, batch, c, w, U(0))
+                grad[3 * c, w] = b[0]
+                grad[3 * c + 1, w] = b[1]
+                grad[3 * c + 2, w] = b[2]
+                mode[4 * c, w] = b[3]
+                mode[4 * c + 1, w] = b[4]
+                mode[4 * c + 2, w] = b[5]
+                mode[4 * c + 3, w] = b[6]
+        for first in range(_BLOCK, whole, _BLOCK):
+            for w in range(_BL):
+                b = _block_sums(ue, gradient, position, batch, c, w, first)
+                grad[3 * c, w] += b[0]
+                grad[3 * c + 1, w] += b[1]
+                grad[3 * c + 2, w] += b[2]
+                mode[4 * c, w] += b[3]
+                mode[4 * c + 1, w] += b[4]
+                mode[4 * c + 2, w] += b[5]
+                mode[4 * c + 3, w] += b[6]
+        for a in range(whole, n):
+            for w in range(_BL):
+                v = ue[3 * a + c, w]
+                grad[3 * c, w] += v * gradient[batch, 3 * a, w]
+                grad[3 * c + 1, w] += v * gradient[batch, 3 * a + 1, w]
+                grad[3 * c + 2, w] += v * gradient[batch, 3 * a + 2, w]
+                if position is not None:
+                    mode[4 * c, w] += v
+                    mode[4 * c + 1, w] += v * position[batch, 3 * a, w]
+                    mode[4 * c + 2, w] += v * position[batch, 3 * a + 1, w]
+                    mode[4 * c + 3, w] += v * position[batch, 3 * a + 2, w]
+        if position is not None:
+            for w in range(_BL):
+                i = inverse[batch]
+                x = mode[4 * c + 1, w]
+                y = mode[4 * c + 2, w]
+                z = mode[4 * c + 3, w]
+                mode[4 * c, w] *= share
+                mode[4 * c + 1, w] = i[0, w] * x + i[1, w] * y + i[2, w] * z
+                mode[4 * c + 2, w] = i[1, w] * x + i[3, w] * y + i[4, w] * z
+                mode[4 * c + 3, w] = i[2, w] * x + i[4, w] * y + i[5, w] * z
 
 
 @_inline
-def _project(ue, position, inverse, batch, members):  # type: ignore[no-untyped-def]
-    """ue <- Q ue (3, n, lanes), Q = I - P (P^T P)^-1 P^T the unweighted linear projector of the domain's nodes.
-
-    With positions X from their mean and A = (X^T X)^-1 it is u_a - mean u - (A X^T u) . X_a: symmetric, so forces along
-    it keep linear and angular momentum, and zero for affine u.
-    """
-    n = U(len(members))
-    zero = ue.dtype.type(0)
-    share = ue.dtype.type(1) / ue.dtype.type(len(members))
-    i = inverse[batch]
-    for c in range(U(3)):
-        for w in range(_BL):
-            s = zero
-            x = zero
-            y = zero
-            z = zero
-            for a in range(n):
-                v = ue[c, a, w]
-                s += v
-                x += v * position[batch, 3 * a, w]
-                y += v * position[batch, 3 * a + 1, w]
-                z += v * position[batch, 3 * a + 2, w]
-            s *= share
-            hx = i[0, w] * x + i[1, w] * y + i[2, w] * z
-            hy = i[1, w] * x + i[3, w] * y + i[4, w] * z
-            hz = i[2, w] * x + i[4, w] * y + i[5, w] * z
-            for a in range(n):
-                ue[c, a, w] -= (
-                    s
-                    + hx * position[batch, 3 * a, w]
-                    + hy * position[batch, 3 * a + 1, w]
-                    + hz * position[batch, 3 * a + 2, w]
-                )
+def _remainder(ue, mode, position, batch, a, c, w):  # type: ignore[no-untyped-def]
+    """Displacement of one lane's node a less its affine part: Q u. Q is symmetric: momentum and moment are kept."""
+    return (
+        ue[3 * a + c, w]
+        - mode[4 * c, w]
+        - mode[4 * c + 1, w] * position[batch, 3 * a, w]
+        - mode[4 * c + 2, w] * position[batch, 3 * a + 1, w]
+        - mode[4 * c + 3, w] * position[batch, 3 * a + 2, w]
+    )
 
 
 @_kernel
-def domain_forces(u, f, nodes, gradient, position, inverse, coefficient, members):  # type: ignore[no-untyped-def]
+def domain_forces(u, f, nodes, gradient, position, inverse, coefficient):  # type: ignore[no-untyped-def]
     """Add the nodal forces of support domains to f; the smallest J among them.
 
     nodes (n_batches, n, lanes) uint32; gradient and position (n_batches, 3 n, lanes), 1/m and m; inverse (n_batches, 6,
     lanes), 1/m^2; coefficient (n_batches, 3, lanes): mu V, lambda V (J), stabilisation kappa (N/m). position and
-    inverse are None where there is no stabilisation (the paper's own). members is a tuple of length n: a fact of its
-    type, so that the compiler unrolls the loops over a domain's nodes.
+    inverse are None where there is no stabilisation (the paper's own).
     """
-    n = U(len(members))
+    n = U(nodes.shape[1])
     one = u.dtype.type(1)
-    zero = u.dtype.type(0)
-    share = one / u.dtype.type(len(members))
-    ue = np.empty((3, len(members), _BL), u.dtype)
+    ue = np.empty((3 * nodes.shape[1], _BL), u.dtype)
     grad = np.empty((9, _BL), u.dtype)
-    smallest = u.dtype.type(np.inf)
+    mode = np.empty((12, _BL), u.dtype)
+    jacobian = np.full(_BL, np.inf).astype(u.dtype)
     for batch in range(U(nodes.shape[0])):
-        for a in range(n):
-            for w in range(_BL):
-                k = U(nodes[batch, a, w])
-                ue[0, a, w] = u[0, k]
-                ue[1, a, w] = u[1, k]
-                ue[2, a, w] = u[2, k]
-        # One pass over the nodes for the gradient and the affine part: `_domain_modes` and `_project` in one.
-        for c in range(U(3)):
-            for w in range(_BL):
-                gx = zero
-                gy = zero
-                gz = zero
-                s = zero
-                x = zero
-                y = zero
-                z = zero
-                for a in range(n):
-                    v = ue[c, a, w]
-                    gx += v * gradient[batch, 3 * a, w]
-                    gy += v * gradient[batch, 3 * a + 1, w]
-                    gz += v * gradient[batch, 3 * a + 2, w]
-                    if position is not None:
-                        s += v
-                        x += v * position[batch, 3 * a, w]
-                        y += v * position[batch, 3 * a + 1, w]
-                        z += v * position[batch, 3 * a + 2, w]
-                grad[3 * c, w] = gx
-                grad[3 * c + 1, w] = gy
-                grad[3 * c + 2, w] = gz
-                if position is not None:
-                    s *= share
-                    i0 = inverse[batch, 0, w]
-                    i1 = inverse[batch, 1, w]
-                    i2 = inverse[batch, 2, w]
-                    i3 = inverse[batch, 3, w]
-                    i4 = inverse[batch, 4, w]
-                    i5 = inverse[batch, 5, w]
-                    hx = i0 * x + i1 * y + i2 * z
-                    hy = i1 * x + i3 * y + i4 * z
-                    hz = i2 * x + i4 * y + i5 * z
-                    for a in range(n):
-                        ue[c, a, w] = coefficient[batch, 2, w] * (
-                            ue[c, a, w]
-                            - s
-                            - hx * position[batch, 3 * a, w]
-                            - hy * position[batch, 3 * a + 1, w]
-                            - hz * position[batch, 3 * a + 2, w]
-                        )
-                else:
-                    for a in range(n):
-                        ue[c, a, w] = zero
+        _domain_modes(u, nodes, gradient, position, inverse, batch, ue, grad, mode)
         for w in range(_BL):
             p = _first_piola(
                 grad[0, w], grad[1, w], grad[2, w], grad[3, w], grad[4, w], grad[5, w], grad[6, w], grad[7, w],
@@ -560,31 +549,32 @@ def domain_forces(u, f, nodes, gradient, position, inverse, coefficient, members
             grad[6, w] = p[6]
             grad[7, w] = p[7]
             grad[8, w] = p[8]
-            smallest = min(smallest, p[9])
-        for c in range(U(3)):
-            for w in range(_BL):
-                for a in range(n):
-                    ue[c, a, w] += (
+            jacobian[w] = min(jacobian[w], p[9])
+        for a in range(n):
+            for c in range(U(3)):
+                for w in range(_BL):
+                    force = (
                         grad[3 * c, w] * gradient[batch, 3 * a, w]
                         + grad[3 * c + 1, w] * gradient[batch, 3 * a + 1, w]
                         + grad[3 * c + 2, w] * gradient[batch, 3 * a + 2, w]
                     )
-        for a in range(n):
+                    if position is not None:
+                        force += coefficient[batch, 2, w] * _remainder(ue, mode, position, batch, a, c, w)
+                    ue[3 * a + c, w] = force
             for w in range(_BL):
                 k = U(nodes[batch, a, w])
-                f[0, k] += ue[0, a, w]
-                f[1, k] += ue[1, a, w]
-                f[2, k] += ue[2, a, w]
-    return smallest
+                f[0, k] += ue[3 * a, w]
+                f[1, k] += ue[3 * a + 1, w]
+                f[2, k] += ue[3 * a + 2, w]
+    return jacobian.min()
 
 
 @_inline
-def _domain_tensors(grad, nodes, gradient, coefficient, stiffness, batch, tensor, factor, one, members):  # type: ignore[no-untyped-def]
-    """Add the bounds of a batch's stiffness at its nodes, times factor, to tensor (6, n_nodes)."""
-    n = U(len(members))
+def _domain_tensors(grad, nodes, gradient, coefficient, stiffness, batch, tensor, factor, one, g):  # type: ignore[no-untyped-def]
+    """Add the bounds of a batch's stiffness at its nodes, times factor, to tensor (6, n_nodes); g (n, 5): scratch."""
+    n = U(nodes.shape[1])
     zero = grad.dtype.type(0)
     tiny = grad.dtype.type(1e-30)
-    g = np.empty((len(members), 5), grad.dtype)
     for w in range(_BL):
         mu = coefficient[batch, 0, w]
         lam = coefficient[batch, 1, w]
@@ -641,7 +631,6 @@ def domain_survey(  # type: ignore[no-untyped-def]
     required,
     factor,
     jacobian,
-    members,
     tensor,
 ):
     """As `hexahedron_survey`, of support domains: strain energy and stabilisation energy.
@@ -651,31 +640,32 @@ def domain_survey(  # type: ignore[no-untyped-def]
     that is at most c (sum_b |g_b|) sum_a (g_a . u_a)^2 / |g_a|; the rest is bounded alike with |B_a|. Next to a grown
     tumour the first is large across the thin layers and small along them.
     """
-    n = U(len(members))
+    n = U(nodes.shape[1])
     one = u.dtype.type(1)
-    ue = np.empty((3, len(members), _BL), u.dtype)
+    ue = np.empty((3 * nodes.shape[1], _BL), u.dtype)
     grad = np.empty((9, _BL), u.dtype)
+    mode = np.empty((12, _BL), u.dtype)
     value = np.empty((3, _BL), u.dtype)
+    g = np.empty((nodes.shape[1], 5), u.dtype)
     strain = 0.0
     stabilisation = 0.0
     for batch in range(U(nodes.shape[0])):
-        _domain_modes(u, nodes, gradient, batch, ue, grad, members)
+        _domain_modes(u, nodes, gradient, position, inverse, batch, ue, grad, mode)
         _batch_survey(grad, coefficient, gram, stiffness, batch, value, one)
         for w in range(_BL):
             jacobian[cells[batch, w]] = value[0, w]
             strain += value[1, w]
         if position is not None:
-            _project(ue, position, inverse, batch, members)
-            for c in range(U(3)):
-                for a in range(n):
+            for a in range(n):
+                for c in range(U(3)):
                     for w in range(_BL):
-                        stabilisation += coefficient[batch, 2, w] * ue[c, a, w] * ue[c, a, w]
+                        stabilisation += coefficient[batch, 2, w] * _remainder(ue, mode, position, batch, a, c, w) ** 2
         if tensor is None:
             for a in range(n):
                 for w in range(_BL):
                     required[nodes[batch, a, w]] += factor * value[2, w]
         else:
-            _domain_tensors(grad, nodes, gradient, coefficient, stiffness, batch, tensor, factor, one, members)
+            _domain_tensors(grad, nodes, gradient, coefficient, stiffness, batch, tensor, factor, one, g)
     return strain, 0.5 * stabilisation
 
 

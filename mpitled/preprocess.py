@@ -54,6 +54,12 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
     # Only now: repair can take a node from its last domain. FE nodes stay, for they have mass from hexahedra.
     orphans = np.setdiff1d(np.arange(mesh.n_fe_nodes, mesh.n_nodes), found.domains)
     mesh, domains = _without(orphans, mesh, found.domains)
+    uncoupled = np.setdiff1d(_members(mesh, "interface"), domains)
+    if len(uncoupled):
+        raise InputError(
+            f"{deck.path}: support.max_fe_nodes = {options.max_fe_nodes}: leaves {len(uncoupled)} interface nodes in "
+            "no support domain, so that hexahedra and cloud would come apart there; raise it"
+        )
     n_fe_nodes, points = mesh.n_fe_nodes, mesh.points
     shapes, gradients, condition = support.moving_least_squares(points[domains], at, options.basis, options.weight)
     field_domains, field_shapes = support.field_at_nodes(points, n_fe_nodes, at, domains, options.basis, options.weight)

@@ -16,11 +16,9 @@ from mpitled.subdomain import Subdomain
 from mpitled.survey import Survey
 
 #: Steps between surveys.
-BETWEEN = 20
+BETWEEN = 10
 #: A mass tensor's trace falls to no less than this share from one survey to the next.
 KEEP = 0.9
-#: The lowest eigenvalue (time counts in steps) until one is known: of a mesh of some hundred cells across.
-LOWEST = 1e-5
 #: The estimate has to hold at so many surveys in a row.
 SETTLED = 3
 
@@ -31,7 +29,8 @@ class Relaxation:
     After Joldes, Wittek and Miller (2011): damping is critical for the lowest eigenvalue, which Rayleigh's quotient of
     the last changes of displacements and forces estimates as it goes. Beyond it: a support domain's mass is a tensor,
     because next to a grown tumour its stiffness across the stretched layers is thousands of times that along them, and
-    scalar masses would make the latter slow. The distance to the static solution is taken from the slowest mode, as its
+    scalar masses would make the latter slow. While the load grows nothing is damped: drag would hold nodes back, and a
+    growing seed run into them. The distance to the static solution is taken from the slowest mode, as its
     speed over its frequency and as its acceleration over its frequency squared, whichever is more.
     """
 
@@ -50,7 +49,7 @@ class Relaxation:
             self.free[held % 3, held // 3] = 0
         self.counted: NDArray[np.float64] = self.free * sub.rows.owned  # free dofs that this rank owns
         self.u_then, self.f_then = np.zeros((3, sub.n_nodes)), np.zeros((3, sub.n_nodes))
-        self.lowest, self.distance, self.frame, self.settled = LOWEST, math.inf, 0, 0
+        self.lowest, self.distance, self.frame, self.settled = 0.0, math.inf, 0, 0
         self.forces, self.motion = compose_forces(sub, force_halo), compose_relaxation(sub, self.counted)
 
     def start_from(self, s: State, energy: float) -> None:
@@ -123,8 +122,6 @@ class Relaxation:
             frequency = math.sqrt(known)
             self.distance = max(figures["change"] / frequency, figures["residual"] / known)
             self.settled = self.settled + 1 if steady and self.distance < self.tolerance else 0
-        elif not loaded:
-            self.lowest = max(known, LOWEST)
         damping = 2 * math.sqrt(self.lowest)
         s.retain, s.gain = (2 - damping) / (2 + damping), 2 / (2 + damping)
         if self.settled >= SETTLED:

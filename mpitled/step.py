@@ -79,7 +79,6 @@ def compose_forces(sub: Subdomain, halo: Halo | None) -> tuple[Term, ...]:
         def support_domains(s: State) -> None:
             J = kernels.domain_forces(
                 s.u, s.f, domains.nodes, domains.gradient, domains.position, domains.inverse, domains.coefficient,
-                domains.members,
             )  # fmt: skip
             s.smallest_jacobian = min(s.smallest_jacobian, J)
 

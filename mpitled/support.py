@@ -79,13 +79,15 @@ def find_domains(
     if wanted is None:
         wanted = np.ones(len(points), bool)
     counts = np.bincount(domains.ravel(), minlength=len(points))
-    poor = np.flatnonzero(wanted & (counts < min_domains))
+    masks = np.array([mask for mask, _ in limits]).reshape(len(limits), len(points))
+    ceilings = np.array([limit for _, limit in limits], np.int64)
     added = 0
-    if len(poor) and len(at):
-        near = _nearest(cKDTree(at), points[poor], min(8 * min_domains, len(at)))
-        masks = np.array([mask for mask, _ in limits]).reshape(len(limits), len(points))
-        ceilings = np.array([limit for _, limit in limits], np.int64)
-        added = _widen(domains, counts, points, at, poor, near, wanted, masks, ceilings, min_domains)
+    # A node that is still in none takes the place of one that stays in at least one.
+    for least in (min_domains, min(min_domains, 1)):
+        poor = np.flatnonzero(wanted & (counts < least))
+        if len(poor) and len(at):
+            near = _nearest(cKDTree(at), points[poor], min(8 * min_domains, len(at)))
+            added += _widen(domains, counts, points, at, poor, near, wanted, masks, ceilings, least)
     return Found(domains, limited, added)
 
 

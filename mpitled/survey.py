@@ -51,7 +51,7 @@ class Survey:
         if (d := sub.domains) is not None:
             more, stabilisation = kernels.domain_survey(
                 s.u, d.nodes, d.cells, d.gradient, d.position, d.inverse, d.coefficient, d.gram, d.stiffness,
-                required, factor, jacobian, d.members, tensor,
+                required, factor, jacobian, tensor,
             )  # fmt: skip
             strain += more
         s.smallest_jacobian = min(s.smallest_jacobian, float(jacobian[:-1].min()))
