@@ -96,6 +96,19 @@ def _parser() -> argparse.ArgumentParser:
     compare.add_argument("--json", action="store_true", help="JSON instead of a table")
     compare.set_defaults(command=_compare)
 
+    study = commands.add_parser("study", help="error against run time over varied keys; goes on where it was stopped")
+    _deck_arguments(study)
+    study.add_argument(
+        "--vary",
+        action="append",
+        default=[],
+        metavar="KEY=A,B,...",
+        help="a family of runs; keys that go together: KEY=A,B+KEY=C,D; ranks=1,2 varies the ranks; repeatable",
+    )
+    study.add_argument("--reference", type=Path, help="what errors are against (see compare); else the own estimate")
+    study.add_argument("--beyond", type=float, metavar="MM", help="errors farther than this from prescribed edges")
+    study.set_defaults(command=_study)
+
     info = commands.add_parser("info", help="versions of what mpitled works with, and what is missing; or of a file")
     info.add_argument("file", type=Path, nargs="?", help="model.h5 or result.vtkhdf: say what it is and holds")
     info.set_defaults(command=_info)
@@ -180,6 +193,15 @@ def _compare(options: argparse.Namespace) -> None:
 
     figures = compare.compare(options.result, options.reference, options.beyond and options.beyond / 1e3)
     print(json.dumps(figures, indent=2) if options.json else compare.table(figures))
+
+
+def _study(options: argparse.Namespace) -> None:
+    from mpitled import study
+
+    beyond = options.beyond and options.beyond / 1e3
+    out = options.out or Path("out") / f"study_{options.deck.stem}"
+    print(study.table(study.study(options.deck, options.reference, options.vary, options.set, out, beyond)))
+    print(f"written to {out}")
 
 
 def _info(options: argparse.Namespace) -> int:

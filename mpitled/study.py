@@ -1,0 +1,186 @@
+"""The study of a scene: error against run time over the keys that trade one for the other, a process for each run."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mpitled import compare
+from mpitled.deck import load_deck
+from mpitled.errors import InputError
+
+COLUMNS = (
+    "family", "value", "ranks", "max_error_mm", "rms_error_mm", "static_distance_mm", "loop_s", "whole_s", "steps",
+    "cells", "cell_updates", "pareto", "failure",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """One run: the deck with the overrides of one value of a family, on so many ranks."""
+
+    family: str  # the varied key, or "as it is"
+    value: str
+    overrides: tuple[str, ...]
+    ranks: int
+
+    @property
+    def folder(self) -> str:
+        """A name that no other variant has, and that a person can read."""
+        text = json.dumps([self.overrides, self.ranks])
+        readable = "".join(c if c.isalnum() or c in "._-" else "-" for c in f"{self.family}-{self.value}")
+        return f"{readable[:60]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
+def variants(vary: Sequence[str], base: Sequence[str]) -> Iterator[Variant]:
+    """The scene as it is, then each "key=a,b,c" in turn, one key at a time; the key "ranks" is the number of ranks.
+
+    Several keys that go together are joined by "+": "a=1,2+b=3,4" is a = 1, b = 3, then a = 2, b = 4.
+    """
+    yield Variant("as it is", "", tuple(base), 1)
+    for text in vary:
+        keys, columns = [], []
+        for part in text.split("+"):
+            key, equals, values = part.partition("=")
+            if not equals or not key.strip() or not values.strip():
+                raise InputError(f"--vary {text}: is not key=value,value,...; write for example cloud.growth=0.15,0.2")
+            keys.append(key.strip())
+            columns.append([value.strip() for value in values.split(",")])
+        if len({len(column) for column in columns}) > 1:
+            raise InputError(f"--vary {text}: keys that go together need as many values each")
+        for chosen in zip(*columns, strict=True):
+            given = dict(zip(keys, chosen, strict=True))
+            ranks = given.pop("ranks", "1")
+            if not ranks.isdecimal() or int(ranks) < 1:
+                raise InputError(f"--vary {text}: ranks = {ranks}: is not a number of ranks; give 1 or more")
+            overrides = (*base, *(f"{key}={value}" for key, value in given.items()))
+            yield Variant("+".join(keys), " ".join(chosen), overrides, int(ranks))
+
+
+def study(
+    deck: Path, reference: Path | None, vary: Sequence[str], base: Sequence[str], out: Path, beyond: float | None
+) -> list[dict[str, Any]]:
+    """Run what has not been run yet, one after the other, and tell what all of them gave: study.csv and study.png.
+
+    Errors (mm) are against the reference beyond so far (m) from edges, or, without one, the run's own estimate.
+    InputError for keys and values that the deck does not take, before anything runs.
+    """
+    todo = list(variants(vary, base))
+    for variant in todo:
+        load_deck(deck, variant.overrides)
+    out.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for i, variant in enumerate(todo, 1):
+        folder = out / variant.folder
+        if not (folder / "done.json").exists():
+            print(f"{i}/{len(todo)}: {variant.family} {variant.value}", file=sys.stderr, flush=True)
+            _run(deck, variant, folder)
+        rows.append(_row(variant, json.loads((folder / "done.json").read_text()), folder, reference, beyond))
+    for row in rows:
+        row["pareto"] = _is_best(row, rows)
+    _write_table(out / "study.csv", rows)
+    try:
+        from mpitled import plot
+    except ImportError:
+        print(f"{out}: no picture, for matplotlib is missing", file=sys.stderr)
+    else:
+        plot.draw_study(rows, out / "study.png", "largest error, mm" if reference else "estimated error, mm")
+    return rows
+
+
+def _run(deck: Path, variant: Variant, folder: Path) -> None:
+    """Compute a variant in its folder; done.json says that it ended, and how."""
+    shutil.rmtree(folder, ignore_errors=True)
+    command = [
+        sys.executable,
+        "-c",
+        "from mpitled.cli import main; main()",
+        "run",
+        str(deck),
+        "-q",
+        "--out",
+        str(folder),
+    ]
+    command += [word for override in variant.overrides for word in ("--set", override)]
+    if variant.ranks > 1:
+        command = ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(variant.ranks), *command]
+    ended = subprocess.run(command, capture_output=True, text=True)
+    lines = [line for line in ended.stderr.splitlines() if line.startswith("mpitled: ")]
+    failure = "" if ended.returncode == 0 else (lines or ended.stderr.splitlines() or ["no reason given"])[-1]
+    folder.mkdir(parents=True, exist_ok=True)
+    temporary = folder / ".done.json"
+    temporary.write_text(json.dumps({"failure": failure.removeprefix("mpitled: ")}))
+    os.replace(temporary, folder / "done.json")
+
+
+def _row(
+    variant: Variant, done: dict[str, str], folder: Path, reference: Path | None, beyond: float | None
+) -> dict[str, Any]:
+    row: dict[str, Any] = dict.fromkeys(COLUMNS, "")
+    row |= {"family": variant.family, "value": variant.value, "ranks": variant.ranks, "failure": done["failure"]}
+    if done["failure"]:
+        return row
+    report = json.loads((folder / "report.json").read_text())
+    cells = sum(report["cells"].values())
+    row |= {
+        "static_distance_mm": report.get("static_distance_mm", ""),
+        "loop_s": report["seconds"]["loop"],
+        "whole_s": sum(report["seconds"].values()),
+        "steps": report["steps"],
+        "cells": cells,
+        "cell_updates": cells * report["steps"],
+    }
+    if reference is None:
+        row["max_error_mm"] = row["static_distance_mm"]
+    else:
+        groups = compare.compare(folder, reference, beyond)["groups"]
+        found = groups["free beyond" if beyond is not None else "free"]
+        row |= {"max_error_mm": found["largest_mm"][-1], "rms_error_mm": found["rms_mm"][-1]}
+    return row
+
+
+def _is_best(row: dict[str, Any], rows: list[dict[str, Any]]) -> bool:
+    """Whether no other run is both more accurate and faster (Pareto)."""
+    if row["max_error_mm"] == "":
+        return False
+    others = (other for other in rows if other is not row and other["max_error_mm"] != "")
+    return not any(
+        other["max_error_mm"] <= row["max_error_mm"]
+        and other["loop_s"] <= row["loop_s"]
+        and (other["max_error_mm"], other["loop_s"]) != (row["max_error_mm"], row["loop_s"])
+        for other in others
+    )
+
+
+def _write_table(path: Path, rows: list[dict[str, Any]]) -> None:
+    temporary = path.with_name(f".{path.name}")
+    with temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows(rows)
+    os.replace(temporary, path)
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """The runs as lines for the terminal, a star for those that none beats in both error and time."""
+    lines = [f"{'':2}{'family':34}{'value':24}{'error, mm':>11}{'rms, mm':>10}{'loop, s':>9}{'steps':>8}{'cells':>9}"]
+    for row in rows:
+        if row["failure"]:
+            lines.append(f"  {row['family']:34}{row['value']:24}  {row['failure'][:90]}")
+            continue
+        numbers = "".join(
+            f"{row[name]:{width}.{digits}g}" if row[name] != "" else " " * width
+            for name, width, digits in (("max_error_mm", 11, 3), ("rms_error_mm", 10, 3), ("loop_s", 9, 3))
+        )
+        star = "*" if row["pareto"] else ""
+        lines.append(f"{star:2}{row['family']:34}{row['value']:24}{numbers}{row['steps']:8}{row['cells']:9}")
+    return "\n".join(lines)

@@ -1,0 +1,66 @@
+"""Studies: every run once, errors against a reference, the best marked, and what fails said."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+
+from conftest import ROOT, complaint, mpitled
+
+CUBE = ROOT / "jobs" / "validation" / "cube.toml"
+REFERENCE = ROOT / "tests" / "data" / "E3_cube_stress_50.npz"
+
+
+def rows(out):
+    with (out / "study.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_study_goes_on_where_it_stopped_and_tells_errors_and_failures(tmp_path):
+    """The cube's compression is homogeneous: any mesh has it to the tolerance that relaxation is given."""
+    out = tmp_path / "study"
+    arguments = [
+        "study", CUBE, "--out", out, "--reference", REFERENCE, "--set", "solver.method=dynamic-relaxation",
+        "--set", "block.elements=[4,4,4]", "--vary", "solver.tolerance=0.1,0.001",
+        "--vary", "solver.load_steps=200,1+ranks=2,1",
+    ]  # fmt: skip
+    first = mpitled(*arguments)
+    assert first.stderr.count("/5: ") == 5
+    table = rows(out)
+    assert [(row["family"], row["value"], row["ranks"]) for row in table] == [
+        ("as it is", "", "1"),
+        ("solver.tolerance", "0.1", "1"),
+        ("solver.tolerance", "0.001", "1"),
+        ("solver.load_steps+ranks", "200 2", "2"),
+        ("solver.load_steps+ranks", "1 1", "1"),
+    ]
+    done, failed = table[:-1], table[-1]
+    assert "unstable" in failed["failure"]  # half the height in one step
+    assert failed["max_error_mm"] == ""
+    for row in done:
+        assert float(row["max_error_mm"]) < 3 * float(row["static_distance_mm"])
+        assert int(row["cell_updates"]) == 64 * int(row["steps"])
+    assert int(done[1]["steps"]) < int(done[2]["steps"])
+    errors = [(float(row["max_error_mm"]), float(row["loop_s"])) for row in done]
+    for row, (error, seconds) in zip(done, errors, strict=True):
+        beaten = any(e <= error and s <= seconds and (e, s) != (error, seconds) for e, s in errors)
+        assert row["pareto"] == str(not beaten)
+    assert (out / "study.png").stat().st_size > 10_000
+
+    removed = next(out.glob("solver.tolerance-0.1-*"))
+    shutil.rmtree(removed)
+    again = mpitled(*arguments)
+    assert again.stderr.count("/5: ") == 1
+    assert removed.exists()
+
+
+def test_what_cannot_be_varied_is_said_before_anything_runs(tmp_path):
+    for vary, word in (
+        ("solver.load_step=1,2", "solver.load_step"),
+        ("solver.tolerance", "key=value"),
+        ("a=1,2+b=3", "as many values"),
+        ("ranks=0", "ranks = 0"),
+    ):
+        line = complaint(mpitled("study", CUBE, "--out", tmp_path / "study", "--vary", vary, status=2))
+        assert word in line
+        assert not (tmp_path / "study").exists()
