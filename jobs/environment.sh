@@ -86,7 +86,9 @@ mpitled_variables() { # for every run
     [ ! -d "$mpitled_root/.deps" ] || mpitled_use_unpacked
 }
 
-mpitled_install() {
+mpitled_has_h5py() { .venv/bin/python -c 'import h5py, sys; sys.exit(not h5py.get_config().mpi)' 2>/dev/null; }
+
+mpitled_prepare() { # MPI, HDF5, and in .venv an h5py built on them
     local python
     python=$(mpitled_python)
     [ -n "$python" ] || { mpitled_apt python3 && python=$(mpitled_python); } || true
@@ -113,9 +115,7 @@ mpitled_install() {
     env "${hdf5[@]}" CC=mpicc CFLAGS="-O1 -g0" DIST_EXTRA_CONFIG="$PWD/.venv/build.cfg" .venv/bin/pip install -q \
         --no-build-isolation --no-cache-dir --no-binary=h5py 'h5py==3.16.*' ||
         mpitled_fail "h5py could not be built against HDF5 with MPI (see above)"
-    .venv/bin/pip install -q --no-build-isolation -e '.[images,pictures,progress,tests]'
-    .venv/bin/python -c 'import h5py, sys; sys.exit(not h5py.get_config().mpi)' ||
-        mpitled_fail "h5py was built without MPI: remove .venv, and try again"
+    mpitled_has_h5py || mpitled_fail "h5py was built without MPI: remove .venv, and try again"
 }
 
 cd "$mpitled_root"
@@ -123,6 +123,9 @@ mpitled_stamp=$(cat pyproject.toml jobs/environment.sh | cksum)
 if [ "$(cat .venv/made-from 2>/dev/null)" = "$mpitled_stamp" ] && [ -x .venv/bin/mpitled ]; then
     mpitled_variables
 else
-    mpitled_install
+    [ ! -x .venv/bin/python ] || mpitled_variables
+    mpitled_has_h5py || mpitled_prepare
+    .venv/bin/pip install -q --no-build-isolation -e '.[images,pictures,progress,tests]' ||
+        mpitled_fail "the packages that pyproject.toml names could not be installed (see above)"
     echo "$mpitled_stamp" >.venv/made-from
 fi

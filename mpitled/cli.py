@@ -1,4 +1,4 @@
-"""The command line: `mpitled run|build|partition|report|compare|info`."""
+"""The command line: `mpitled run|build|check|export|partition|report|compare|info`."""
 
 from __future__ import annotations
 
@@ -61,6 +61,19 @@ def _parser() -> argparse.ArgumentParser:
     build = commands.add_parser("build", help="build the model of a deck")
     _deck_arguments(build)
     build.set_defaults(command=_build)
+
+    check = commands.add_parser("check", help="check a mesh file or a deck, and say what is in it")
+    check.add_argument("file", type=Path, help="a mesh (Abaqus, LS-DYNA, or what meshio reads), or a deck (TOML)")
+    check.add_argument(
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override a key of the deck; repeatable"
+    )
+    check.set_defaults(command=_check)
+
+    export = commands.add_parser("export", help="write a model as decks that run to the same result, here or elsewhere")
+    export.add_argument("model", type=Path, help="model.h5, or the folder that holds it")
+    export.add_argument("--abaqus", action="store_true", required=True, help="as Abaqus decks and a CSV table")
+    export.add_argument("--out", type=Path, metavar="DIR", help="folder of the decks (export beside the model)")
+    export.set_defaults(command=_export)
 
     part = commands.add_parser("partition", help="partition a model ahead of a job")
     part.add_argument("model", type=Path, help="model.h5, or the folder that holds it")
@@ -127,10 +140,30 @@ def _build(options: argparse.Namespace) -> None:
     print(describe_model(path))
 
 
-def _partition(options: argparse.Namespace) -> None:
-    from mpitled.run import MODEL, divide
+def _check(options: argparse.Namespace) -> None:
+    from mpitled import overview
 
-    path = options.model / MODEL if options.model.is_dir() else options.model
+    print(overview.check(options.file, options.set))
+
+
+def _export(options: argparse.Namespace) -> None:
+    from mpitled import export
+
+    path = _model(options.model)
+    for written in export.write_abaqus(path, options.out or path.parent / "export"):
+        print(written)
+
+
+def _model(path: Path) -> Path:
+    from mpitled.run import MODEL
+
+    return path / MODEL if path.is_dir() else path
+
+
+def _partition(options: argparse.Namespace) -> None:
+    from mpitled.run import divide
+
+    path = _model(options.model)
     if options.parts < 2:
         raise InputError(f"{options.parts} parts: one rank needs no partition; ask for 2 or more")
     print(divide(path, options.parts, options.seed))

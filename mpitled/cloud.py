@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpitled.errors import InputError
+from mpitled.hexahedra import geometry, nodal_sum
 from mpitled.mesh import CORNERS, Mesh, numbered_mesh
 
 if TYPE_CHECKING:
@@ -72,6 +73,7 @@ class Filling:
     integration_volumes: NDArray[np.float64]  # (n_integration,), m^3
     interface: NDArray[np.int64]  # FE nodes on the void's boundary, ascending
     seed_nodes: NDArray[np.int64]  # EFG nodes on the seed's surface, ascending
+    surface_areas: NDArray[np.float64]  # (n_nodes, 3), m^2: see `Mesh`
     spacing: Spacing
     figures: dict[str, float]
 
@@ -96,7 +98,7 @@ def fill_void(
     EFG nodes; so a cloud without hexahedra ends on the given surface. `element_size` (m) is the largest spacing
     unless the deck gives one. The same arguments give the same bits.
 
-    Raises InputError if nothing is dropped or if the seed does not lie inside the void.
+    Raises InputError if nothing is dropped, if no node fits in, or if the seed does not lie inside the void.
     """
     if not dropped.any():
         raise InputError("cloud: no hexahedron is replaced by it; enlarge cloud.radius or core_share")
@@ -125,7 +127,19 @@ def fill_void(
         figures["seed_volume_m3"] = _ball(spacing.radius)
         figures["integration_volume_before_rescaling_m3"] = sampled
 
+    # The mean gradients' sum over all hexahedra of a node is the outer surface's share of it.
+    around = hexahedra[on_boundary[hexahedra].any(axis=1)]
+    gradients, weights = geometry(points, around)
+    areas = nodal_sum(around, weights[:, None, None] * gradients, len(points))
+    areas[~on_boundary] = 0.0
+    new_areas = np.zeros((len(kept) + len(seed) + len(inner), 3))
+    new_areas[: len(kept)] = areas[kept]
+
     n_efg = np.count_nonzero(on_boundary & ~in_fe) + len(seed) + len(inner)
+    if n_efg == 0:
+        raise InputError(
+            "cloud: no node fits into the hexahedra that it replaces; replace more, or lower cloud.spacing"
+        )
     figures["integration_points_per_efg_node"] = float(len(volumes) / n_efg)
     return Filling(
         points=np.concatenate([points[kept], seed, inner]),
@@ -136,6 +150,7 @@ def fill_void(
         integration_volumes=volumes,
         interface=new_numbers[on_boundary & in_fe],
         seed_nodes=np.arange(len(kept), len(kept) + len(seed)),
+        surface_areas=new_areas,
         spacing=spacing,
         figures=figures,
     )
@@ -163,6 +178,7 @@ def with_cloud(
         filling.integration_volumes,
         node_sets,
         filling.figures,
+        filling.surface_areas,
     )
 
 

@@ -85,6 +85,10 @@ class Block:
     core_share: float = key('share of each edge that `cloud = "core"` replaces', 0.5, limits="(0, 1)")
 
 
+_Length = Literal["m", "cm", "mm"]
+_Stress = Literal["Pa", "kPa", "MPa", "GPa"]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cylinder:
     """Geometry: a cylinder along z that stands on z = 0, around the origin."""
@@ -113,10 +117,31 @@ class Ellipsoid:
 class MeshFiles:
     """Geometry: meshes made by other programs."""
 
-    fe: Path = key("nodes, hexahedra and sets; relative to the deck's folder")
-    efg: Path | None = key("nodes of the cloud", None)
-    integration_points: Path | None = key("integration points x, y, z, volume", None)
-    unit: Literal["m", "cm", "mm"] = key("unit of length in these files", "m")
+    fe: Path | None = key(
+        "nodes, hexahedra and sets (Abaqus, LS-DYNA, or what meshio reads); from the deck's folder", None
+    )
+    efg: Path | None = key("nodes of the cloud; those on the interface may be repeated", None)
+    integration_points: Path | None = key("CSV or HDF5 with x, y, z, volume, and sets if need be", None)
+    dropped: tuple[str, ...] = key("cell sets of `fe` whose hexahedra the cloud replaces", ())
+    cuts: int = key(
+        "without `integration_points`: parts of a dropped hexahedron along each edge; if none is dropped, the cells "
+        "of `efg` are the integration cells",
+        2,
+        limits="[1, 16]",
+    )
+    surface_areas: Path | None = key(
+        "CSV of node, x, y, z: the outer surface's share of constant stress at nodes on the cloud's boundary", None
+    )
+    unit: _Length = key("unit of length of `fe`, and of the others unless they have one", "m")
+    efg_unit: _Length | None = key("unit of length of `efg`", None)
+    integration_unit: _Length | None = key("unit of length of `integration_points`", None)
+    stress_unit: _Stress = key("unit of stress of `fe`, and of `efg` unless it has one", "Pa")
+    efg_stress_unit: _Stress | None = key("unit of stress of `efg`", None)
+    density_unit: Literal["consistent", "kg/m3", "g/cm3", "kg/mm3", "t/mm3"] = key(
+        "unit of density of both; consistent: that goes with length, stress and seconds, as t/mm3 with mm and MPa",
+        "consistent",
+    )
+    repair: bool = key("put the nodes of hexahedra in order that are numbered inside out or crosswise", False)
     merge_tolerance: float = key("nodes of both meshes closer than this are one", 0.001, "mm", "[0, inf)")
 
 
@@ -127,7 +152,7 @@ class Tumour:
     centre: tuple[float, float, float] = key("centre of seed and tumour, in the image's coordinates", unit="mm")
     volume: float = key("volume of the whole sphere at full load", unit="mm3", limits="(0, inf)")
     seed_radius: float = key("radius of the sphere at the start", 2.0, "mm", "(0, inf)")
-    surface_nodes: int = key("nodes on the seed's surface; fewer leave its hull short", 400, limits="[12, inf)")
+    surface_nodes: int = key("nodes on the seed's surface; fewer leave its hull short", 800, limits="[12, inf)")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,20 +160,20 @@ class Cloud:
     """EFG nodes and integration points in place of hexahedra."""
 
     radius: float = key("tissue hexahedra this near to the tumour's centre are replaced", 18.0, "mm", "(0, inf)")
-    growth: float = key("node spacing as a share of the distance to the seed's centre", 0.3, limits="(0, inf)")
+    growth: float = key("node spacing as a share of the distance to the seed's centre", 0.2, limits="(0, inf)")
     spacing: float = key("largest node spacing; 0: the size of a hexahedron", 0.0, "mm", "[0, inf)")
     irregularity: float = key("random shift of nodes as a share of the spacing", 0.3, limits="[0, 0.5)")
     seed: int = key("seed of the random numbers", 0, limits="[0, inf)")
-    points_per_spacing: float = key("integration cells per node spacing, in each direction", 1.4, limits="(0, inf)")
+    points_per_spacing: float = key("integration cells per node spacing, in each direction", 1.1, limits="(0, inf)")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Support:
     """Support domains of the integration points."""
 
-    nodes: int = key("nodes in a support domain, n", 8, limits="[4, inf)")
+    nodes: int = key("nodes in a support domain, n; the paper: 8", 12, limits="[4, inf)")
     basis: Literal[4, 10, 20] = key("monomials of the basis, m: linear, quadratic, cubic", 4)
-    weight: Literal["equal", "quartic"] = key("weight function of the moving least squares", "equal")
+    weight: Literal["equal", "quartic"] = key("weight of the moving least squares; the paper: equal", "quartic")
     max_fe_nodes: int = key("most FE nodes in a support domain", 7, limits="[0, inf)")
     min_domains: int = key("every EFG node is in at least so many support domains", 3, limits="[1, inf)")
     stabilisation: float = key(
@@ -207,11 +232,16 @@ class Displaced:
 class Solver:
     """Explicit time integration."""
 
-    method: Literal["quasi-static"] = key("slow loading, with mass scaling where the step needs it", "quasi-static")
-    load_time: float = key("duration of the load", 2.0, "s", "(0, inf)")
+    method: Literal["quasi-static", "dynamic-relaxation", "dynamic"] = key(
+        "slow loading; damped steps to the static solution; or waves, with the true masses", "quasi-static"
+    )
+    load_time: float = key("quasi-static, dynamic: duration of the load", 2.0, "s", "(0, inf)")
+    hold_time: float = key("quasi-static, dynamic: duration after it, at full load", 0.0, "s", "[0, inf)")
+    load_steps: int = key("dynamic-relaxation: steps in which the load grows", 500, limits="[1, inf)")
+    tolerance: float = key("dynamic-relaxation ends this near to the static solution", 0.01, "mm", "(0, inf)")
     time_step: Literal["auto"] | float = key("time step; auto: from the stability bound", "auto", "s", "(0, inf)")
     safety: float = key("share of the stability bound that the step takes", 0.8, limits="(0, 1]")
-    mass_scaling: bool = key("raise the mass of cells that the step is too long for", True)
+    mass_scaling: bool = key("quasi-static: raise the mass of nodes that the step is too long for", True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -288,8 +318,10 @@ class _Source(NamedTuple):
     overridden: frozenset[str]
 
     def error(self, name: str, what: str, value: Any = MISSING) -> InputError:
-        where = "--set" if name in self.overridden else self.path
-        return InputError(f"{where}: {name}{'' if value is MISSING else f' = {_show(value)}'}: {what}")
+        # An override of a part, or of the section around it, is to blame too.
+        overridden = any(f"{name}.".startswith(f"{o}.") or o.startswith(f"{name}.") for o in self.overridden)
+        shown = "" if value is MISSING else f" = {_show(value)}"
+        return InputError(_line(f"{'--set' if overridden else self.path}: {name}{shown}: {what}"))
 
 
 def _parse(path: Path) -> dict[str, Any]:
@@ -313,13 +345,14 @@ def _syntax(text: str, error: Exception) -> str:
     message, line = str(error), re.search(r"line (\d+)", str(error))
     if not line:
         return f"{message}; correct the TOML"
-    shown = _shorten(text.splitlines()[int(line[1]) - 1].strip())
+    shown = _shorten(_line(text.split("\n")[int(line[1]) - 1].strip()))
     return f"line {line[1]}: {message[: line.start()].rstrip(' (at')}: {shown}; correct the TOML"
 
 
 def _override(table: dict[str, Any], text: str) -> str:
     """Enter "section.key=value" into the table of the deck; the key's name."""
     name, equals, value = (part.strip() for part in text.partition("="))
+    text = _line(text)
     steps = name.split(".")
     if not equals or not all(steps):
         raise InputError(f"--set {text}: is not section.key=value; write for example --set tumour.volume=523.6")
@@ -426,7 +459,11 @@ def _value(hint: Any, value: Any, about: _Key, name: str, source: _Source) -> An
         raise source.error(name, f"{error}; give {_expected(hint, about)}{default}", value) from None
     if isinstance(converted, Path):
         converted = source.path.parent / converted
-        if not converted.is_file():
+        try:
+            there = converted.is_file()
+        except OSError:  # a name that is too long
+            there = False
+        if not there:
             raise source.error(name, f"there is no file {converted}; give a path relative to the deck's folder", value)
     return _si(converted, about.unit)
 
@@ -538,6 +575,11 @@ def _show(value: Any) -> str:
     return f"{value:.10g}" if isinstance(value, float) else _shorten(str(value))
 
 
+def _line(text: str) -> str:
+    """Names and overrides can hold line breaks, messages must not."""
+    return " ".join(text.splitlines())
+
+
 def _shorten(text: str) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
@@ -545,13 +587,13 @@ def _shorten(text: str) -> str:
 # --- what keys ask of each other -----------------------------------------------------------------------------------
 
 
-_GEOMETRIES = ("labels", "block", "cylinder", "ellipsoid", "mesh")
+GEOMETRIES = ("labels", "block", "cylinder", "ellipsoid", "mesh")
 _OFFERED = "[labels], [block], [cylinder], [ellipsoid] and [mesh]"
 
 
 def _check(deck: Deck, source: _Source) -> None:
     given = canonical(deck)
-    geometries = [name for name in _GEOMETRIES if name in given]
+    geometries = [name for name in GEOMETRIES if name in given]
     if len(geometries) != 1:
         found = f"has {' and '.join(f'[{name}]' for name in geometries) or 'no geometry'}"
         raise InputError(f"{deck.path}: {found}; give exactly one of {_OFFERED}")
@@ -629,13 +671,19 @@ def canonical(deck: Deck) -> dict[str, Any]:
     return plain(deck)
 
 
-_MODEL = (*_GEOMETRIES, "tumour", "cloud", "support", "hexahedra", "materials", "fixed", "displaced")
+_MODEL = (*GEOMETRIES, "tumour", "cloud", "support", "hexahedra", "materials", "fixed", "displaced")
 
 
-def model_key(deck: Deck) -> str:
-    """What determines the model, as canonical JSON: values in SI units, and files by the SHA-256 of their contents."""
+def model_key(deck: Deck, included: Sequence[Path] = ()) -> str:
+    """What determines the model, as canonical JSON: values in SI units, and files by the SHA-256 of their contents.
+
+    `included` are files that those of the deck read in turn.
+    """
     sections = asdict(deck)
-    return json.dumps({name: sections[name] for name in _MODEL}, sort_keys=True, separators=(",", ":"), default=_digest)
+    content: dict[str, Any] = {name: sections[name] for name in _MODEL}
+    if included:
+        content["included"] = list(included)
+    return json.dumps(content, sort_keys=True, separators=(",", ":"), default=_digest)
 
 
 def _digest(path: Path) -> str:

@@ -100,6 +100,12 @@ def nodal_mass(cells: NDArray[np.integer], cell_mass: NDArray[np.float64], n_nod
     return np.bincount(cells.ravel(), share, n_nodes).astype(np.float64, copy=False)
 
 
+def nodal_sum(cells: NDArray[np.int64], values: NDArray[np.float64], n_nodes: int) -> NDArray[np.float64]:
+    """Sum (n_nodes, 3) of the values (n_cells, n, 3) of cells at their nodes."""
+    flat = cells.ravel()
+    return np.stack([np.bincount(flat, values[..., i].ravel(), n_nodes) for i in range(3)], axis=1)
+
+
 def corner_jacobians(points: NDArray[np.float64], hexahedra: NDArray[np.integer]) -> NDArray[np.float64]:
     """Determinants (n, 8), m^3, of the map from [-1, 1]^3 at the corners: negative where a cell is turned over."""
     x = points[hexahedra]
@@ -129,7 +135,7 @@ def aspect(points: NDArray[np.float64], hexahedra: NDArray[np.integer]) -> NDArr
     for chunk in _chunks(len(hexahedra)):
         lengths = _edge_lengths(points[hexahedra[chunk]])
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio[chunk] = np.nan_to_num(lengths.max(axis=1) / lengths.min(axis=1), nan=np.inf)
+            ratio[chunk] = np.nan_to_num(lengths.max(axis=1) / lengths.min(axis=1), nan=np.inf, posinf=np.inf)
     return ratio
 
 

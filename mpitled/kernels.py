@@ -19,6 +19,7 @@ PADDING = VOXEL_LANES  # a short run reads beyond its last node, and never write
 _ROUND = np.uint64(8)
 _VL = np.uint64(VOXEL_LANES)
 _BL = np.uint64(BATCH_LANES)
+_BLOCK = np.uint64(8)  # nodes of a support domain that are summed in registers
 # Fused multiply-adds and free association, but NaN and infinity stay what they are: the watch needs them.
 _FAST = {"contract", "nsz", "arcp", "reassoc"}
 _inline = njit(fastmath=_FAST, error_model="numpy", cache=True)
@@ -416,136 +417,124 @@ def hexahedron_survey(u, nodes, cells, geometry, coefficient, gram, stiffness, r
 # ---------------------------------------------------------------- support domains, gathered
 
 
-@_inline
-def _domain_modes(u, nodes, gradient, batch, ue, grad, members):  # type: ignore[no-untyped-def]
-    """Nodal displacements (3, n, lanes) and grad u (9, lanes) of a batch of support domains."""
-    n = U(len(members))
+@njit(fastmath=_FAST, error_model="numpy", inline="always")
+def _block_sums(ue, gradient, position, batch, c, w, first):  # type: ignore[no-untyped-def]
+    """Sums over a block of a domain's nodes, in one lane: u B_a (3), u and u X_a (3)."""
+    zero = ue.dtype.type(0)
+    gx = zero
+    gy = zero
+    gz = zero
+    s = zero
+    x = zero
+    y = zero
+    z = zero
+    for b in range(_BLOCK):
+        a = first + b
+        v = ue[3 * a + c, w]
+        gx += v * gradient[batch, 3 * a, w]
+        gy += v * gradient[batch, 3 * a + 1, w]
+        gz += v * gradient[batch, 3 * a + 2, w]
+        if position is not None:
+            s += v
+            x += v * position[batch, 3 * a, w]
+            y += v * position[batch, 3 * a + 1, w]
+            z += v * position[batch, 3 * a + 2, w]
+    return gx, gy, gz, s, x, y, z
+
+
+@njit(fastmath=_FAST, error_model="numpy", inline="always")
+def _domain_modes(u, nodes, gradient, position, inverse, batch, ue, grad, mode):  # type: ignore[no-untyped-def]
+    """Nodal displacements (3 n, lanes), grad u (9, lanes) and the affine part (12, lanes) of a batch of domains.
+
+    The affine part of u, by the unweighted linear projector of the domain's nodes, is for each component the mean and
+    the three slopes along the positions X from theirs: (X^T X)^-1 X^T u. Without position there is none. Blocks of
+    constant length are unrolled into sums in registers, which loops over all n nodes are not when n is large.
+    """
+    n = U(nodes.shape[1])
+    whole = n // _BLOCK * _BLOCK
     zero = u.dtype.type(0)
+    share = u.dtype.type(1) / u.dtype.type(nodes.shape[1])
     for a in range(n):
         for w in range(_BL):
             k = U(nodes[batch, a, w])
-            ue[0, a, w] = u[0, k]
-            ue[1, a, w] = u[1, k]
-            ue[2, a, w] = u[2, k]
+            ue[3 * a, w] = u[0, k]
+            ue[3 * a + 1, w] = u[1, k]
+            ue[3 * a + 2, w] = u[2, k]
+    if whole == 0:
+        grad[:] = zero
+        mode[:] = zero
     for c in range(U(3)):
-        for w in range(_BL):
-            x = zero
-            y = zero
-            z = zero
-            for a in range(n):
-                v = ue[c, a, w]
-                x += v * gradient[batch, 3 * a, w]
-                y += v * gradient[batch, 3 * a + 1, w]
-                z += v * gradient[batch, 3 * a + 2, w]
-            grad[3 * c, w] = x
-            grad[3 * c + 1, w] = y
-            grad[3 * c + 2, w] = z
+        if whole > 0:
+            for w in range(_BL):
+                b = _block_sums(ue, gradient, position, batch, c, w, U(0))
+                grad[3 * c, w] = b[0]
+                grad[3 * c + 1, w] = b[1]
+                grad[3 * c + 2, w] = b[2]
+                mode[4 * c, w] = b[3]
+                mode[4 * c + 1, w] = b[4]
+                mode[4 * c + 2, w] = b[5]
+                mode[4 * c + 3, w] = b[6]
+        for first in range(_BLOCK, whole, _BLOCK):
+            for w in range(_BL):
+                b = _block_sums(ue, gradient, position, batch, c, w, first)
+                grad[3 * c, w] += b[0]
+                grad[3 * c + 1, w] += b[1]
+                grad[3 * c + 2, w] += b[2]
+                mode[4 * c, w] += b[3]
+                mode[4 * c + 1, w] += b[4]
+                mode[4 * c + 2, w] += b[5]
+                mode[4 * c + 3, w] += b[6]
+        for a in range(whole, n):
+            for w in range(_BL):
+                v = ue[3 * a + c, w]
+                grad[3 * c, w] += v * gradient[batch, 3 * a, w]
+                grad[3 * c + 1, w] += v * gradient[batch, 3 * a + 1, w]
+                grad[3 * c + 2, w] += v * gradient[batch, 3 * a + 2, w]
+                if position is not None:
+                    mode[4 * c, w] += v
+                    mode[4 * c + 1, w] += v * position[batch, 3 * a, w]
+                    mode[4 * c + 2, w] += v * position[batch, 3 * a + 1, w]
+                    mode[4 * c + 3, w] += v * position[batch, 3 * a + 2, w]
+        if position is not None:
+            for w in range(_BL):
+                i = inverse[batch]
+                x = mode[4 * c + 1, w]
+                y = mode[4 * c + 2, w]
+                z = mode[4 * c + 3, w]
+                mode[4 * c, w] *= share
+                mode[4 * c + 1, w] = i[0, w] * x + i[1, w] * y + i[2, w] * z
+                mode[4 * c + 2, w] = i[1, w] * x + i[3, w] * y + i[4, w] * z
+                mode[4 * c + 3, w] = i[2, w] * x + i[4, w] * y + i[5, w] * z
 
 
 @_inline
-def _project(ue, position, inverse, batch, members):  # type: ignore[no-untyped-def]
-    """ue <- Q ue (3, n, lanes), Q = I - P (P^T P)^-1 P^T the unweighted linear projector of the domain's nodes.
-
-    With positions X from their mean and A = (X^T X)^-1 it is u_a - mean u - (A X^T u) . X_a: symmetric, so forces along
-    it keep linear and angular momentum, and zero for affine u.
-    """
-    n = U(len(members))
-    zero = ue.dtype.type(0)
-    share = ue.dtype.type(1) / ue.dtype.type(len(members))
-    i = inverse[batch]
-    for c in range(U(3)):
-        for w in range(_BL):
-            s = zero
-            x = zero
-            y = zero
-            z = zero
-            for a in range(n):
-                v = ue[c, a, w]
-                s += v
-                x += v * position[batch, 3 * a, w]
-                y += v * position[batch, 3 * a + 1, w]
-                z += v * position[batch, 3 * a + 2, w]
-            s *= share
-            hx = i[0, w] * x + i[1, w] * y + i[2, w] * z
-            hy = i[1, w] * x + i[3, w] * y + i[4, w] * z
-            hz = i[2, w] * x + i[4, w] * y + i[5, w] * z
-            for a in range(n):
-                ue[c, a, w] -= (
-                    s
-                    + hx * position[batch, 3 * a, w]
-                    + hy * position[batch, 3 * a + 1, w]
-                    + hz * position[batch, 3 * a + 2, w]
-                )
+def _remainder(ue, mode, position, batch, a, c, w):  # type: ignore[no-untyped-def]
+    """Displacement of one lane's node a less its affine part: Q u. Q is symmetric: momentum and moment are kept."""
+    return (
+        ue[3 * a + c, w]
+        - mode[4 * c, w]
+        - mode[4 * c + 1, w] * position[batch, 3 * a, w]
+        - mode[4 * c + 2, w] * position[batch, 3 * a + 1, w]
+        - mode[4 * c + 3, w] * position[batch, 3 * a + 2, w]
+    )
 
 
 @_kernel
-def domain_forces(u, f, nodes, gradient, position, inverse, coefficient, members):  # type: ignore[no-untyped-def]
+def domain_forces(u, f, nodes, gradient, position, inverse, coefficient):  # type: ignore[no-untyped-def]
     """Add the nodal forces of support domains to f; the smallest J among them.
 
     nodes (n_batches, n, lanes) uint32; gradient and position (n_batches, 3 n, lanes), 1/m and m; inverse (n_batches, 6,
     lanes), 1/m^2; coefficient (n_batches, 3, lanes): mu V, lambda V (J), stabilisation kappa (N/m). position and
-    inverse are None where there is no stabilisation (the paper's own). members is a tuple of length n: a fact of its
-    type, so that the compiler unrolls the loops over a domain's nodes.
+    inverse are None where there is no stabilisation (the paper's own).
     """
-    n = U(len(members))
+    n = U(nodes.shape[1])
     one = u.dtype.type(1)
-    zero = u.dtype.type(0)
-    share = one / u.dtype.type(len(members))
-    ue = np.empty((3, len(members), _BL), u.dtype)
+    ue = np.empty((3 * nodes.shape[1], _BL), u.dtype)
     grad = np.empty((9, _BL), u.dtype)
-    smallest = u.dtype.type(np.inf)
+    mode = np.empty((12, _BL), u.dtype)
+    jacobian = np.full(_BL, np.inf).astype(u.dtype)
     for batch in range(U(nodes.shape[0])):
-        for a in range(n):
-            for w in range(_BL):
-                k = U(nodes[batch, a, w])
-                ue[0, a, w] = u[0, k]
-                ue[1, a, w] = u[1, k]
-                ue[2, a, w] = u[2, k]
-        # One pass over the nodes for the gradient and the affine part: `_domain_modes` and `_project` in one.
-        for c in range(U(3)):
-            for w in range(_BL):
-                gx = zero
-                gy = zero
-                gz = zero
-                s = zero
-                x = zero
-                y = zero
-                z = zero
-                for a in range(n):
-                    v = ue[c, a, w]
-                    gx += v * gradient[batch, 3 * a, w]
-                    gy += v * gradient[batch, 3 * a + 1, w]
-                    gz += v * gradient[batch, 3 * a + 2, w]
-                    if position is not None:
-                        s += v
-                        x += v * position[batch, 3 * a, w]
-                        y += v * position[batch, 3 * a + 1, w]
-                        z += v * position[batch, 3 * a + 2, w]
-                grad[3 * c, w] = gx
-                grad[3 * c + 1, w] = gy
-                grad[3 * c + 2, w] = gz
-                if position is not None:
-                    s *= share
-                    i0 = inverse[batch, 0, w]
-                    i1 = inverse[batch, 1, w]
-                    i2 = inverse[batch, 2, w]
-                    i3 = inverse[batch, 3, w]
-                    i4 = inverse[batch, 4, w]
-                    i5 = inverse[batch, 5, w]
-                    hx = i0 * x + i1 * y + i2 * z
-                    hy = i1 * x + i3 * y + i4 * z
-                    hz = i2 * x + i4 * y + i5 * z
-                    for a in range(n):
-                        ue[c, a, w] = coefficient[batch, 2, w] * (
-                            ue[c, a, w]
-                            - s
-                            - hx * position[batch, 3 * a, w]
-                            - hy * position[batch, 3 * a + 1, w]
-                            - hz * position[batch, 3 * a + 2, w]
-                        )
-                else:
-                    for a in range(n):
-                        ue[c, a, w] = zero
+        _domain_modes(u, nodes, gradient, position, inverse, batch, ue, grad, mode)
         for w in range(_BL):
             p = _first_piola(
                 grad[0, w], grad[1, w], grad[2, w], grad[3, w], grad[4, w], grad[5, w], grad[6, w], grad[7, w],
@@ -560,51 +549,123 @@ def domain_forces(u, f, nodes, gradient, position, inverse, coefficient, members
             grad[6, w] = p[6]
             grad[7, w] = p[7]
             grad[8, w] = p[8]
-            smallest = min(smallest, p[9])
-        for c in range(U(3)):
-            for w in range(_BL):
-                for a in range(n):
-                    ue[c, a, w] += (
+            jacobian[w] = min(jacobian[w], p[9])
+        for a in range(n):
+            for c in range(U(3)):
+                for w in range(_BL):
+                    force = (
                         grad[3 * c, w] * gradient[batch, 3 * a, w]
                         + grad[3 * c + 1, w] * gradient[batch, 3 * a + 1, w]
                         + grad[3 * c + 2, w] * gradient[batch, 3 * a + 2, w]
                     )
-        for a in range(n):
+                    if position is not None:
+                        force += coefficient[batch, 2, w] * _remainder(ue, mode, position, batch, a, c, w)
+                    ue[3 * a + c, w] = force
             for w in range(_BL):
                 k = U(nodes[batch, a, w])
-                f[0, k] += ue[0, a, w]
-                f[1, k] += ue[1, a, w]
-                f[2, k] += ue[2, a, w]
-    return smallest
+                f[0, k] += ue[3 * a, w]
+                f[1, k] += ue[3 * a + 1, w]
+                f[2, k] += ue[3 * a + 2, w]
+    return jacobian.min()
+
+
+@_inline
+def _domain_tensors(grad, nodes, gradient, coefficient, stiffness, batch, tensor, factor, one, g):  # type: ignore[no-untyped-def]
+    """Add the bounds of a batch's stiffness at its nodes, times factor, to tensor (6, n_nodes); g (n, 5): scratch."""
+    n = U(nodes.shape[1])
+    zero = grad.dtype.type(0)
+    tiny = grad.dtype.type(1e-30)
+    for w in range(_BL):
+        mu = coefficient[batch, 0, w]
+        lam = coefficient[batch, 1, w]
+        k = _cofactor(
+            grad[0, w] + one, grad[1, w], grad[2, w], grad[3, w], grad[4, w] + one, grad[5, w], grad[6, w], grad[7, w],
+            grad[8, w] + one,
+        )  # fmt: skip
+        J = k[9]
+        square = (one + one) * (grad[0, w] + grad[4, w] + grad[8, w]) + (one + one + one)
+        for i in range(9):
+            square += grad[i, w] * grad[i, w]
+        sum_g = zero
+        sum_b = zero
+        for a in range(n):
+            bx = gradient[batch, 3 * a, w]
+            by = gradient[batch, 3 * a + 1, w]
+            bz = gradient[batch, 3 * a + 2, w]
+            x = k[0] * bx + k[1] * by + k[2] * bz
+            y = k[3] * bx + k[4] * by + k[5] * bz
+            z = k[6] * bx + k[7] * by + k[8] * bz
+            g[a, 0] = x
+            g[a, 1] = y
+            g[a, 2] = z
+            g[a, 3] = np.sqrt(x * x + y * y + z * z)
+            g[a, 4] = np.sqrt(bx * bx + by * by + bz * bz)
+            sum_g += g[a, 3]
+            sum_b += g[a, 4]
+        q = lam * (J - one) - mu / J
+        along = factor * (lam + mu / (J * J)) * sum_g
+        alike = factor * (mu + abs(q) * np.sqrt((one + one) * square)) * sum_b
+        for a in range(n):
+            node = nodes[batch, a, w]
+            s = along / (g[a, 3] + tiny)
+            d = alike * g[a, 4] + factor * stiffness[batch, w]
+            tensor[0, node] += s * g[a, 0] * g[a, 0] + d
+            tensor[1, node] += s * g[a, 0] * g[a, 1]
+            tensor[2, node] += s * g[a, 0] * g[a, 2]
+            tensor[3, node] += s * g[a, 1] * g[a, 1] + d
+            tensor[4, node] += s * g[a, 1] * g[a, 2]
+            tensor[5, node] += s * g[a, 2] * g[a, 2] + d
 
 
 @_kernel
 def domain_survey(  # type: ignore[no-untyped-def]
-    u, nodes, cells, gradient, position, inverse, coefficient, gram, stiffness, required, factor, jacobian, members
+    u,
+    nodes,
+    cells,
+    gradient,
+    position,
+    inverse,
+    coefficient,
+    gram,
+    stiffness,
+    required,
+    factor,
+    jacobian,
+    tensor,
 ):
-    """As `hexahedron_survey`, of support domains: strain energy and stabilisation energy."""
-    n = U(len(members))
+    """As `hexahedron_survey`, of support domains: strain energy and stabilisation energy.
+
+    Where tensor (6, n_nodes) is given, it takes what the domains ask, as tensors, in place of required. A domain's
+    material stiffness is that of one direction g_a = K B_a at each node: c (sum_a g_a . u_a)^2. By Cauchy's inequality
+    that is at most c (sum_b |g_b|) sum_a (g_a . u_a)^2 / |g_a|; the rest is bounded alike with |B_a|. Next to a grown
+    tumour the first is large across the thin layers and small along them.
+    """
+    n = U(nodes.shape[1])
     one = u.dtype.type(1)
-    ue = np.empty((3, len(members), _BL), u.dtype)
+    ue = np.empty((3 * nodes.shape[1], _BL), u.dtype)
     grad = np.empty((9, _BL), u.dtype)
+    mode = np.empty((12, _BL), u.dtype)
     value = np.empty((3, _BL), u.dtype)
+    g = np.empty((nodes.shape[1], 5), u.dtype)
     strain = 0.0
     stabilisation = 0.0
     for batch in range(U(nodes.shape[0])):
-        _domain_modes(u, nodes, gradient, batch, ue, grad, members)
+        _domain_modes(u, nodes, gradient, position, inverse, batch, ue, grad, mode)
         _batch_survey(grad, coefficient, gram, stiffness, batch, value, one)
         for w in range(_BL):
             jacobian[cells[batch, w]] = value[0, w]
             strain += value[1, w]
         if position is not None:
-            _project(ue, position, inverse, batch, members)
-            for c in range(U(3)):
-                for a in range(n):
+            for a in range(n):
+                for c in range(U(3)):
                     for w in range(_BL):
-                        stabilisation += coefficient[batch, 2, w] * ue[c, a, w] * ue[c, a, w]
-        for a in range(n):
-            for w in range(_BL):
-                required[nodes[batch, a, w]] += factor * value[2, w]
+                        stabilisation += coefficient[batch, 2, w] * _remainder(ue, mode, position, batch, a, c, w) ** 2
+        if tensor is None:
+            for a in range(n):
+                for w in range(_BL):
+                    required[nodes[batch, a, w]] += factor * value[2, w]
+        else:
+            _domain_tensors(grad, nodes, gradient, coefficient, stiffness, batch, tensor, factor, one, g)
     return strain, 0.5 * stabilisation
 
 
@@ -626,7 +687,8 @@ def react(u, u_prev, f, mass, dofs, full, amplitude, reaction, time_step):  # ty
     """Work (J) of the reactions at moving dofs over the last step, by the trapezoidal rule; renews the reactions.
 
     A reaction is f + m a, a being the central difference to the place that the dof is moved to next (4.2.1: the
-    displaced nodes take u_max d(t + dt)). dofs, full (n,): 3 node + direction and metres at full load.
+    displaced nodes take u_max d(t + dt)); where mass is None prescribed dofs have none. dofs, full (n,): 3 node +
+    direction and metres at full load.
     """
     work = 0.0
     for p in range(dofs.size):
@@ -634,10 +696,21 @@ def react(u, u_prev, f, mass, dofs, full, amplitude, reaction, time_step):  # ty
         c = dofs[p] % 3
         now = u[c, node]
         before = u_prev[c, node]
-        r = f[c, node] + mass[node] * (amplitude * full[p] - 2 * now + before) / (time_step * time_step)
+        r = f[c, node]
+        if mass is not None:
+            r += mass[node] * (amplitude * full[p] - 2 * now + before) / (time_step * time_step)
         work += 0.5 * (r + reaction[p]) * (now - before)
         reaction[p] = r
     return work
+
+
+@_inline
+def _prescribe(u, fixed, dofs, full, amplitude):  # type: ignore[no-untyped-def]
+    zero = u.dtype.type(0)
+    for p in range(fixed.size):
+        u[fixed[p] % 3, fixed[p] // 3] = zero
+    for p in range(dofs.size):
+        u[dofs[p] % 3, dofs[p] // 3] = amplitude * full[p]
 
 
 @_kernel
@@ -655,10 +728,56 @@ def update(u, u_prev, f, mobility, fixed, dofs, full, amplitude):  # type: ignor
         for n in range(U(mobility.size)):
             before[n] = (now[n] - before[n]) + now[n] - mobility[n] * fc[n]
             fc[n] = zero
-    for p in range(fixed.size):
-        u_prev[fixed[p] % 3, fixed[p] // 3] = zero
-    for p in range(dofs.size):
-        u_prev[dofs[p] % 3, dofs[p] // 3] = amplitude * full[p]
+    _prescribe(u_prev, fixed, dofs, full, amplitude)
+
+
+@_kernel
+def relax(u, u_prev, f, mobility, counted, fixed, dofs, full, amplitude, retain, gain):  # type: ignore[no-untyped-def]
+    """As `update`, with a mobility tensor at each node (6, n_nodes: xx, xy, xz, yy, yz, zz) and damping.
+
+    u+ = u + retain (u - u_prev) - gain mobility f: with damping c per step, (2 - c) / (2 + c) and 2 / (2 + c).
+    Returns the work (J) of the internal forces where counted (3, n_nodes) is 1 and not 0, at free dofs that the rank
+    owns: each force times the mean of the steps before and after it.
+    """
+    zero = u.dtype.type(0)
+    half = u.dtype.type(0.5)
+    work = 0.0
+    for n in range(U(counted.shape[1])):
+        fx = f[0, n]
+        fy = f[1, n]
+        fz = f[2, n]
+        x = u[0, n] + retain * (u[0, n] - u_prev[0, n])
+        y = u[1, n] + retain * (u[1, n] - u_prev[1, n])
+        z = u[2, n] + retain * (u[2, n] - u_prev[2, n])
+        x -= gain * (mobility[0, n] * fx + mobility[1, n] * fy + mobility[2, n] * fz)
+        y -= gain * (mobility[1, n] * fx + mobility[3, n] * fy + mobility[4, n] * fz)
+        z -= gain * (mobility[2, n] * fx + mobility[4, n] * fy + mobility[5, n] * fz)
+        work += half * (
+            counted[0, n] * fx * (x - u_prev[0, n])
+            + counted[1, n] * fy * (y - u_prev[1, n])
+            + counted[2, n] * fz * (z - u_prev[2, n])
+        )
+        u_prev[0, n] = x
+        u_prev[1, n] = y
+        u_prev[2, n] = z
+        f[0, n] = zero
+        f[1, n] = zero
+        f[2, n] = zero
+    _prescribe(u_prev, fixed, dofs, full, amplitude)
+    return work
+
+
+@njit(cache=True)
+def change_step(u, u_prev, f, mobility, ratio):  # type: ignore[no-untyped-def]
+    """Rewrites u_prev so that `update` with the new step's mobility takes a step `ratio` times as long as the last.
+
+    That is u+ = u + r (u - u_prev) - (1 + 1 / r) / 2 mobility f, the central difference with a variable step.
+    """
+    gain = 0.5 * (1 + 1 / ratio)
+    for c in range(3):
+        for n in range(mobility.size):
+            now = u[c, n]
+            u_prev[c, n] = now - ratio * (now - u_prev[c, n]) + (gain - 1) * mobility[n] * f[c, n]
 
 
 @njit(cache=True)
@@ -703,6 +822,101 @@ def raise_mass(u, u_prev, mass, mobility, required, counted, time_step):  # type
                     v = (u[c, n] - u_prev[c, n]) / time_step
                     energy += 0.5 * dm * v * v
     return added, energy
+
+
+@njit(cache=True)
+def renew_tensors(mass, required, mobility, free, keep):  # type: ignore[no-untyped-def]
+    """mass (6, n) <- required (6, n), mobility (6, n) <- its inverse, of free dofs alone; nothing at prescribed ones.
+
+    free (3, n) is 1 at free dofs and 0 at prescribed ones. A mass that would fall below `keep` of what it was is scaled
+    up to that: cells that swing stiffen again before the next survey.
+    """
+    for n in range(required.shape[1]):
+        x = free[0, n]
+        y = free[1, n]
+        z = free[2, n]
+        r = required[:, n]
+        xx = r[0] * x
+        xy = r[1] * x * y
+        xz = r[2] * x * z
+        yy = r[3] * y
+        yz = r[4] * y * z
+        zz = r[5] * z
+        trace = xx + yy + zz
+        least = keep * (mass[0, n] + mass[3, n] + mass[5, n])
+        s = least / trace if 0 < trace < least else 1.0
+        mass[0, n] = s * xx
+        mass[1, n] = s * xy
+        mass[2, n] = s * xz
+        mass[3, n] = s * yy
+        mass[4, n] = s * yz
+        mass[5, n] = s * zz
+        # Prescribed dofs take part in the inverse as ones.
+        xx = mass[0, n] + 1 - x
+        yy = mass[3, n] + 1 - y
+        zz = mass[5, n] + 1 - z
+        k0, k1, k2, _, k4, k5, _, _, k8, determinant = _cofactor(
+            xx, mass[1, n], mass[2, n], mass[1, n], yy, mass[4, n], mass[2, n], mass[4, n], zz
+        )
+        mobility[0, n] = x * k0 / determinant
+        mobility[1, n] = x * y * k1 / determinant
+        mobility[2, n] = x * z * k2 / determinant
+        mobility[3, n] = y * k4 / determinant
+        mobility[4, n] = y * z * k5 / determinant
+        mobility[5, n] = z * k8 / determinant
+
+
+@njit(cache=True)
+def watch_relaxation(u, u_prev, f, mass, mobility, counted, u_then, f_then):  # type: ignore[no-untyped-def]
+    """What relaxation has to know, of dofs where counted (3, n) is 1; renews u_then and f_then (3, n).
+
+    Kinetic energy; the forces' work in the half step to the present (`relax` counts it with the next step); numerator
+    and denominator of Rayleigh's quotient of the change since then, du . df / du . M du; the largest change in the last
+    step, m; the largest M^-1 f, m (time counts in steps).
+    """
+    kinetic = 0.0
+    work = 0.0
+    numerator = 0.0
+    denominator = 0.0
+    change = 0.0
+    residual = 0.0
+    for n in range(counted.shape[1]):
+        x = counted[0, n]
+        y = counted[1, n]
+        z = counted[2, n]
+        m = mass[:, n]
+        vx = x * (u[0, n] - u_prev[0, n])
+        vy = y * (u[1, n] - u_prev[1, n])
+        vz = z * (u[2, n] - u_prev[2, n])
+        dx = x * (u[0, n] - u_then[0, n])
+        dy = y * (u[1, n] - u_then[1, n])
+        dz = z * (u[2, n] - u_then[2, n])
+        fx = x * f[0, n]
+        fy = y * f[1, n]
+        fz = z * f[2, n]
+        kinetic += 0.5 * (
+            m[0] * vx * vx + m[3] * vy * vy + m[5] * vz * vz
+            + 2 * (m[1] * vx * vy + m[2] * vx * vz + m[4] * vy * vz)
+        )  # fmt: skip
+        work += 0.5 * (fx * vx + fy * vy + fz * vz)
+        numerator += dx * (fx - f_then[0, n]) + dy * (fy - f_then[1, n]) + dz * (fz - f_then[2, n])
+        denominator += (
+            m[0] * dx * dx + m[3] * dy * dy + m[5] * dz * dz
+            + 2 * (m[1] * dx * dy + m[2] * dx * dz + m[4] * dy * dz)
+        )  # fmt: skip
+        change = max(change, vx * vx + vy * vy + vz * vz)
+        m = mobility[:, n]
+        ax = m[0] * fx + m[1] * fy + m[2] * fz
+        ay = m[1] * fx + m[3] * fy + m[4] * fz
+        az = m[2] * fx + m[4] * fy + m[5] * fz
+        residual = max(residual, ax * ax + ay * ay + az * az)
+        u_then[0, n] = u[0, n]
+        u_then[1, n] = u[1, n]
+        u_then[2, n] = u[2, n]
+        f_then[0, n] = fx
+        f_then[1, n] = fy
+        f_then[2, n] = fz
+    return kinetic, work, numerator, denominator, np.sqrt(change), np.sqrt(residual)
 
 
 @_kernel

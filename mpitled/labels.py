@@ -88,7 +88,7 @@ def mesh_labels(labels: deck.Labels, cloud: deck.Cloud, tumour: deck.Tumour | No
     # The solid has no cavities: a node that fewer than eight cubes share lies on the outer surface.
     node_sets["skull"] = np.flatnonzero(np.bincount(hexahedra.ravel()) < 8)
     figures, n_fe_nodes = head.figures, len(points)
-    integration_points, integration_volumes = np.empty((0, 3)), np.empty(0)
+    integration_points, integration_volumes, surface_areas = np.empty((0, 3)), np.empty(0), None
     if tumour is not None:
         void = _void(head, cloud.radius, np.asarray(tumour.centre, float))
         filling = fill_void(points, hexahedra, void[head.solid], cloud, tumour, head.grid.size)
@@ -99,6 +99,7 @@ def mesh_labels(labels: deck.Labels, cloud: deck.Cloud, tumour: deck.Tumour | No
         cell_sets = {name: np.flatnonzero(cells[head.solid & ~void]) for name, cells in head.parts.items()}
         cell_sets["tissue"] = np.append(cell_sets["tissue"], len(hexahedra) + np.arange(len(integration_volumes)))
         figures = figures | filling.figures
+        surface_areas = filling.surface_areas
     cell_sets["all"] = np.arange(len(hexahedra) + len(integration_volumes))
     return Mesh(
         points=points,
@@ -109,6 +110,7 @@ def mesh_labels(labels: deck.Labels, cloud: deck.Cloud, tumour: deck.Tumour | No
         node_sets=node_sets,
         cell_sets=cell_sets,
         node_ids=np.arange(1, len(points) + 1),
+        surface_areas=surface_areas,
         remarks=head.remarks,
         figures=figures,
     )

@@ -29,7 +29,8 @@ class Constraint:
 
     node_set: str
     directions: tuple[int, ...]  # of 0, 1, 2
-    displacement: tuple[float, ...]  # m at full load, one for each direction; 0 where fixed
+    #: m at full load, one for each direction, 0 where fixed; or (n_nodes,) where the set's nodes move differently
+    displacement: tuple[float | NDArray[np.float64], ...]
     origin: str = ""  # file and line or key, for messages
     rotation: Rotation | None = None  # beside the displacement
 
@@ -49,6 +50,8 @@ class Mesh:
     node_sets: dict[str, NDArray[np.int64]]  # name -> ascending nodes
     cell_sets: dict[str, NDArray[np.int64]]  # name -> ascending cells
     node_ids: NDArray[np.int64]  # (n_nodes,), numbers in the file that the nodes came from
+    # (n_nodes, 3), m^2: integral of N_a n over the outer surface, at nodes on the cloud's boundary; None: unknown.
+    surface_areas: NDArray[np.float64] | None = None
     materials: dict[str, Material] = field(default_factory=dict)  # cell set -> material, where the file says so
     constraints: tuple[Constraint, ...] = ()  # where the file says so
     remarks: tuple[str, ...] = ()  # what the reader skipped, merged or repaired, a line each
@@ -78,6 +81,7 @@ def numbered_mesh(
     integration_volumes: NDArray[np.float64],
     node_sets: dict[str, NDArray[np.int64]],
     figures: dict[str, float],
+    surface_areas: NDArray[np.float64] | None = None,
 ) -> Mesh:
     """A mesh that comes from no file: nodes count from 1, cell sets are all, hexahedra and cloud."""
     cells = np.arange(len(hexahedra) + len(integration_points))
@@ -90,6 +94,7 @@ def numbered_mesh(
         node_sets=node_sets,
         cell_sets={"all": cells, "hexahedra": cells[: len(hexahedra)], "cloud": cells[len(hexahedra) :]},
         node_ids=np.arange(1, len(points) + 1),
+        surface_areas=surface_areas,
         figures=figures,
     )
 

@@ -36,6 +36,7 @@ class Model:
     prescribed_turns: NDArray[np.float64]  # (n_prescribed, 3), how it gets there if not straight, see `loading.turn`
     node_sets: dict[str, NDArray[np.int64]]
     cell_sets: dict[str, NDArray[np.int64]]
+    surface_areas: NDArray[np.float64] | None = None  # (n_nodes, 3), m^2, as the mesh has them: for the export
     figures: dict[str, float] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
 

@@ -23,13 +23,13 @@ from mpitled.deck import Deck
 from mpitled.errors import InputError, InterruptedRun, MpitledError, UnstableError
 from mpitled.halo import Halo, World
 from mpitled.loading import sphere_radius
-from mpitled.step import Survey, compose, start
+from mpitled.march import March
+from mpitled.relaxation import Relaxation
+from mpitled.step import Term
 from mpitled.subdomain import Subdomain, localise
 
-#: Cost of a hexahedron and of a support domain in a step, measured with `pytest -m study tests/test_kernels.py`.
-CELL_COSTS = (1.0, 3.0)
-#: The cells are surveyed at least so many times in a run, and at least once in so many steps.
-SURVEYS, LONGEST_UNWATCHED = 100, 50
+#: Cost in a step of a node of a support domain, in hexahedra, as `pytest -m study tests/test_kernels.py` measures it.
+DOMAIN_NODE_COST = 0.3
 #: The energy balance may be wrong by this share of the largest energy; beyond it the run is unstable.
 BALANCE_LIMIT = 0.05
 #: So many steps from rest the ledger is too coarse to judge by: its trapezoidal rule is wrong by about 8 over the steps
@@ -55,27 +55,33 @@ class Phases:
 def build(deck: Deck, directory: Path) -> tuple[Path, bool]:
     """The model of a deck in directory/model.h5, and whether it had to be built: the same deck uses it again."""
     path = directory / MODEL
-    key = decks.model_key(deck)
+    included: list[Path] = []
+    if deck.mesh:
+        from mpitled import meshes
+
+        included = meshes.files(deck.mesh)
+    key = decks.model_key(deck, included)
     if store.model_key(path) == key:
         return path, False
     directory.mkdir(parents=True, exist_ok=True)
     from mpitled import preprocess  # only the rank that builds needs the meshers
 
-    store.write_model(path, preprocess.build(deck), key)
+    store.write_model(path, preprocess.build(deck), key, decks.canonical(deck))
     return path, True
 
 
 def divide(path: Path, n_parts: int, seed: int) -> str:
     """Partition a model in n_parts, stored in its file under that number; a table of the parts."""
     model = store.read_model(path)
+    costs = (1.0, DOMAIN_NODE_COST * model.domains.shape[1])
     graph = partition.cell_graph(model.hexahedra, model.domains, model.domain_points)
     try:
-        part = partition.cut(graph, n_parts, CELL_COSTS, seed)
+        part = partition.cut(graph, n_parts, costs, seed)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from None
     tables = partition.tables(model.hexahedra, model.domains, part, n_parts)
     store.write_partition(path, tables)
-    return partition.figures(tables, CELL_COSTS, len(model.hexahedra), graph).describe()
+    return partition.figures(tables, costs, len(model.hexahedra), graph).describe()
 
 
 def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False) -> dict[str, Any]:
@@ -93,8 +99,10 @@ def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False) -> di
         rows = store.read_part(path, world.size, world.rank)
         rule = deck.hexahedra.gradient
         sub = localise(rows, deck.hexahedra.hourglass, deck.support.stabilisation, rule)
-        critical = store.read_figures(path)
-    return _Loop(deck, directory, world, sub, critical, phases, quiet).run()
+        figures = store.read_figures(path)
+    with everywhere():  # each rank finds the same
+        run = _Run(deck, directory, world, sub, figures, phases, quiet)
+    return run.run()
 
 
 @contextmanager
@@ -127,16 +135,11 @@ def _on_leader(world: World, work: Any) -> Any:
     return outcome
 
 
-def schedule(load_time: float, longest_step: float, frames: int) -> tuple[int, int, int]:
-    """Steps of the run, steps between surveys, and surveys between frames, so that each falls on the next."""
-    steps = math.ceil(load_time / longest_step * (1 - 1e-12))
-    between = min(LONGEST_UNWATCHED, max(1, steps // SURVEYS))
-    surveys = max(1, math.ceil(steps / (between * frames)))
-    between = math.ceil(steps / (surveys * frames))
-    return between * surveys * frames, between, surveys
+#: What is not summed over the ranks.
+_EXTREMES = {"min_jacobian": min, "step_ratio": max, "change": max, "residual": max}
 
 
-class _Loop:
+class _Run:
     """The time loop of one rank and what is watched, written and counted around it."""
 
     def __init__(
@@ -145,32 +148,34 @@ class _Loop:
         directory: Path,
         world: World,
         sub: Subdomain,
-        critical: dict[str, float],
+        model: dict[str, float],
         phases: Phases,
         quiet: bool,
     ) -> None:
         self.deck, self.directory, self.world, self.sub, self.phases = deck, directory, world, sub, phases
-        solver = deck.solver
-        self.scales_mass = solver.mass_scaling
-        if solver.time_step == "auto":
-            longest = solver.safety * critical["critical_step_median_s" if self.scales_mass else "critical_step_min_s"]
+        self.force_halo = self._halo(3)
+        solver, frames = deck.solver, deck.output.frames
+        self.method: March | Relaxation
+        if solver.method == "dynamic-relaxation":
+            self.method = self._relaxation()
         else:
-            longest = float(solver.time_step)
-        n_steps, self.between, self.surveys = schedule(solver.load_time, longest, deck.output.frames)
-        self.halo = Halo(world, sub.shared, 3) if world.size > 1 else None
-        self.terms = compose(sub, self.halo)
-        self.survey = Survey(
-            sub, Halo(world, sub.shared, 1) if world.size > 1 else None, self.scales_mass, solver.safety
-        )
-        self.state = start(sub, n_steps, solver.load_time / n_steps)
-        self.progress = None if quiet or not world.leads else _Progress(n_steps)
+            self.method = March(solver, frames, sub, self.force_halo, self._halo(1), model)
+        self.progress = None if quiet or not world.leads else _Progress()
         self.interrupted = 0
-        self.term_seconds = dict.fromkeys((name for name, _ in self.terms), 0.0)
+        self.term_seconds: dict[str, float] = {}
         self.largest_kinetic_ratio = 0.0
         self.largest_energy = 0.0
+        self.own_energy = 0.0  # J, in this rank's cells
+        self.distance = math.nan
         # The strain energy of the undeformed body is no better than this, J: tr C - 3 and ln J are not quite 0.
-        self.noise = 8 * np.finfo(float).eps * max(m.mu for m in sub.rows.materials) * critical["volume_m3"]
+        self.noise = 8 * np.finfo(float).eps * max(m.mu for m in sub.rows.materials) * model["volume_m3"]
         self.figures: dict[str, float] = {}
+
+    def _halo(self, components: int) -> Halo | None:
+        return Halo(self.world, self.sub.shared, components) if self.world.size > 1 else None
+
+    def _relaxation(self) -> Relaxation:
+        return Relaxation(self.deck.solver, self.deck.output.frames, self.sub, self.force_halo, self._halo(6))
 
     # ------------------------------------------------------------ the loop
 
@@ -188,7 +193,14 @@ class _Loop:
         )
         begin = time.perf_counter()
         try:
-            self._march(writer)
+            self._advance(writer)
+            self.phases.seconds["loop"] = time.perf_counter() - begin - self.phases.seconds.get("output", 0.0)
+            made = self._run_figures(self.phases.seconds["loop"])
+            if isinstance(self.method, Relaxation):
+                self.distance = self.method.distance
+            elif self.deck.solver.method == "quasi-static":
+                with self.phases("static distance"):
+                    self.distance = self._distance_to_static()
         except MpitledError:
             writer.abandon(self._run_figures(time.perf_counter() - begin))
             raise
@@ -197,46 +209,62 @@ class _Loop:
                 signal.signal(which, handler)
             if self.progress:
                 self.progress.close()
-        self.phases.seconds["loop"] = time.perf_counter() - begin - self.phases.seconds.get("output", 0.0)
-        writer.close(self._run_figures(self.phases.seconds["loop"]))
+        if math.isfinite(self.distance):
+            made["static_distance_mm"] = 1e3 * self.distance
+        writer.close(made | {"seconds": dict(self.phases.seconds)})
         with self.phases("report"):
             from mpitled import report
 
-            made = _on_leader(self.world, lambda: report.write(self.directory, self.phases.seconds))
-        return made
+            return _on_leader(self.world, lambda: report.write(self.directory, self.phases.seconds))
 
-    def _march(self, writer: store.ResultWriter) -> None:
-        state, clock = self.state, time.perf_counter
-        forces, update = self.terms[:-1], self.terms[-1][1]
-        seconds, terms = self.term_seconds, self.terms
-        while True:
-            for name, term in forces:
+    def _advance(self, writer: store.ResultWriter | None) -> None:
+        """Steps, a survey and decisions, and so on to the end of the method."""
+        method, clock = self.method, time.perf_counter
+        state, forces, motion = method.state, method.forces, method.motion
+        reactions, update = motion[:-1], motion[-1:]
+        seconds = self.term_seconds = dict.fromkeys((name for name, _ in (*forces, *motion)), 0.0)
+
+        def take(terms: tuple[Term, ...]) -> None:
+            for name, term in terms:
                 begin = clock()
                 term(state)
                 seconds[name] += clock() - begin
+
+        step, last = (*update, *forces, *reactions), False
+        take((*forces, *reactions))
+        while True:
             with everywhere():
                 self._watch()
-            if state.step % (self.between * self.surveys) == 0:
+            due, last = method.decide(self.figures)
+            if due and writer is not None:
                 with self.phases("output"):
                     self._write(writer)
-            if state.step == state.n_steps:
+            if last:
                 return
-            update(state)
-            for _ in range(self.between - 1):
-                for name, term in terms:
-                    begin = clock()
-                    term(state)
-                    seconds[name] += clock() - begin
+            for _ in range(method.between):
+                take(step)
+
+    def _distance_to_static(self) -> float:
+        """How far (m, the largest of all nodes) a ramp's end is from the static solution: found by going there."""
+        figures, seconds, end = self.figures, self.term_seconds, self.method.state
+        self.method = relaxation = self._relaxation()
+        relaxation.start_from(end, self.own_energy)
+        moved = math.nan
+        try:
+            self._advance(None)
+            n = self.sub.n_nodes
+            own = np.abs(relaxation.state.u[:, :n] - end.u[:, :n]).max()
+            moved = float(self.world.gather([own]).max()) + relaxation.distance
+        except UnstableError:
+            pass  # the run itself is well; only the estimate is not to be had
+        self.figures, self.term_seconds = figures, seconds
+        return moved
 
     def _warm_up(self) -> None:
         """Compile, or load from the disk's cache: rank 0 first, so that the others find its work there."""
         if not self.world.leads:
             self.world.barrier()
-        scratch = start(self.sub, self.state.n_steps, self.state.time_step)
-        for name, term in self.terms:
-            if name != "halo":
-                term(scratch)
-        Survey(self.sub, None, True, 1.0).look(scratch)
+        self.method.warm_up()
         if self.world.leads:
             self.world.barrier()
 
@@ -244,56 +272,61 @@ class _Loop:
 
     def _watch(self) -> None:
         """Survey all ranks, keep the ledger, and end the run on all of them alike if it cannot go on."""
-        state, world = self.state, self.world
-        own = self.survey.look(state)
+        state, world = self.method.state, self.world
+        own = self.method.look()
+        self.own_energy = own["strain"] + own["hourglass"] + own["stabilisation"]
         table = world.gather([*own.values(), float(self.interrupted)])
         columns = dict(zip(own, table.T, strict=False))
-        figures = {name: float(sum(columns[name])) for name in own}
-        figures["min_jacobian"] = float(columns["min_jacobian"].min())
-        figures["step_ratio"] = float(columns["step_ratio"].max())
+        figures = {name: float(_EXTREMES.get(name, sum)(columns[name])) for name in own}
         internal = figures["strain"] + figures["hourglass"] + figures["stabilisation"]
-        supplied = figures["external"] + figures["added"]
-        self.largest_energy = max(self.largest_energy, abs(supplied), internal, figures["kinetic"])
+        supplied = figures["external"] + figures["added"] - figures["dissipated"]
+        self.largest_energy = max(self.largest_energy, abs(figures["external"]), internal, figures["kinetic"])
         figures["balance_error"] = abs(supplied - internal - figures["kinetic"]) / (self.largest_energy or 1.0)
         figures["kinetic_ratio"] = figures["kinetic"] / internal if internal > 0 else 0.0
         if state.share >= 0.1:
             self.largest_kinetic_ratio = max(self.largest_kinetic_ratio, figures["kinetic_ratio"])
         self.figures = figures
         if self.progress:
-            self.progress.show(state.step, figures)
+            self.progress.show(self.method.progress, state.step, figures)
         finite = math.isfinite(internal + figures["kinetic"] + figures["external"])
+        balance = figures["balance_error"] * self.largest_energy
         if not finite or figures["min_jacobian"] <= 0:
+            reason = "a cell is turned inside out"
+        elif balance > BALANCE_LIMIT * self.largest_energy + self.noise and state.step >= LEDGER_STARTS:
+            reason = (
+                f"the energy balance is wrong by {figures['balance_error']:.1%} (supplied {supplied:.3g} J, internal "
+                f"{internal:.3g} J, kinetic {figures['kinetic']:.3g} J)"
+            )
+        else:
+            reason = ""
+        if reason:
             worst = int(np.argmin(np.where(np.isnan(columns["min_jacobian"]), -np.inf, columns["min_jacobian"])))
-            raise UnstableError(world.broadcast(self._inverted() if world.rank == worst else None, worst))
-        wrong = figures["balance_error"] * self.largest_energy > BALANCE_LIMIT * self.largest_energy + self.noise
-        if wrong and state.step >= LEDGER_STARTS:
+            cell = world.broadcast(self._worst_cell() if world.rank == worst else None, worst)
             raise UnstableError(
-                f"unstable at {state.share:.1%} of the load: the energy balance is wrong by "
-                f"{figures['balance_error']:.1%} (external and added {supplied:.3g} J, internal {internal:.3g} J, "
-                f"kinetic {figures['kinetic']:.3g} J); the step is {figures['step_ratio']:.2f} times the one proved "
-                "stable: set solver.time_step smaller, or solver.mass_scaling = true, or solver.load_time longer"
+                f"unstable at {state.share:.1%} of the load: {reason}; {cell}; the step is "
+                f"{figures['step_ratio']:.2f} of the longest proved stable; load more slowly (solver.load_time, "
+                "solver.load_steps), refine the mesh or the cloud there, or enlarge cloud.radius"
             )
         if table[:, -1].any():
             raise InterruptedRun(f"interrupted at {state.share:.1%} of the load; what was written is readable")
 
-    def _inverted(self) -> str:
-        """What happened in the worst cell of this rank, in one line."""
-        rows, jacobian = self.sub.rows, self.survey.jacobian[:-1]
+    def _worst_cell(self) -> str:
+        """What and where the cell with the smallest J on this rank is, in a few words."""
+        rows, jacobian = self.sub.rows, self.method.survey.jacobian[:-1]
         cell = int(np.argmin(np.where(np.isnan(jacobian), -np.inf, jacobian)))
         n_hexahedra = len(rows.hexahedra)
         hexahedron = cell < n_hexahedra
-        place = (
-            rows.points[np.searchsorted(rows.nodes, rows.hexahedra[cell])].mean(axis=0)
-            if hexahedron
-            else rows.domain_points[cell - n_hexahedra]
-        )
-        x, y, z = place * 1e3
+        nodes = rows.hexahedra[cell] if hexahedron else rows.domains[cell - n_hexahedra]
+        local = np.searchsorted(rows.nodes, nodes)
+        x, y, z = 1e3 * (rows.points[local].mean(axis=0) if hexahedron else rows.domain_points[cell - n_hexahedra])
+        edges = rows.points[local] - rows.points[local].mean(axis=0)
+        stretched = edges + self.method.state.u[:, local].T - self.method.state.u[:, local].T.mean(axis=0)
+        stretch = np.linalg.norm(stretched, axis=1).max() / np.linalg.norm(edges, axis=1).max()
         return (
-            f"unstable at {self.state.share:.1%} of the load: {'hexahedron' if hexahedron else 'support domain'} "
-            f"{rows.cells[cell]} ({rows.materials[rows.material[cell]].name}) at ({x:.1f}, {y:.1f}, {z:.1f}) mm on "
-            f"rank {self.world.rank} is turned inside out (J = {jacobian[cell]:.3g}, smallest so far "
-            f"{self.state.smallest_jacobian:.3g}); refine the cloud or the mesh there, enlarge cloud.radius, or load "
-            "more slowly (solver.load_time)"
+            f"worst is {'hexahedron' if hexahedron else 'support domain'} {rows.cells[cell]} "
+            f"({rows.materials[rows.material[cell]].name}) at ({x:.1f}, {y:.1f}, {z:.1f}) mm on rank {self.world.rank} "
+            f"with J = {jacobian[cell]:.3g} now, {self.method.state.smallest_jacobian:.3g} at its worst, and a stretch "
+            f"of {stretch:.3g}"
         )
 
     def _interrupt(self, signum: int, frame: object) -> None:
@@ -318,16 +351,16 @@ class _Loop:
         }
 
     def _write(self, writer: store.ResultWriter) -> None:
-        rows, u = self.sub.rows, self.state.u[:, : self.sub.n_nodes]
+        rows, u = self.sub.rows, self.method.state.u[:, : self.sub.n_nodes]
         domains = np.searchsorted(rows.nodes, rows.domains)
         at_points = np.einsum("ga,cga->gc", rows.domain_shapes, u[:, domains])
         displacement = np.concatenate([u.T[rows.owned], at_points])
         field = np.concatenate([self._field(u, domains)[rows.owned], at_points])
         series = {name: self.figures[name] for name in _SERIES}
         writer.write_frame(
-            self.state.step * self.state.time_step,
+            self.method.frame_time,
             {"displacement": displacement, "field_displacement": field},
-            {"J": self.survey.jacobian[:-1]},
+            {"J": self.method.survey.jacobian[:-1]},
             series,
         )
 
@@ -340,14 +373,14 @@ class _Loop:
         field[:, np.searchsorted(rows.nodes, rows.field_nodes)] = np.einsum(
             "ga,cga->cg", rows.field_shapes, u[:, giving]
         )
-        if self.halo is not None:
-            self.halo.sum(field)
+        if self.force_halo is not None:
+            self.force_halo.sum(field)
         return field.T
 
     def _run_figures(self, loop_seconds: float) -> dict[str, Any]:
         """What the report says of the run itself. Collective."""
-        state, rows, world = self.state, self.sub.rows, self.world
-        halo_seconds = sum(self.halo.seconds.values()) if self.halo else 0.0
+        state, rows, world = self.method.state, self.sub.rows, self.world
+        halo_seconds = sum(self.force_halo.seconds.values()) if self.force_halo else 0.0
         computing = sum(
             self.term_seconds.get(name, 0.0) for name in ("voxel hexahedra", "hexahedra", "support domains")
         )
@@ -385,6 +418,7 @@ class _Loop:
                 "stabilisation": figures["stabilisation"],
                 "kinetic": figures["kinetic"],
                 "added_mass": figures["added"],
+                "dissipated": figures["dissipated"],
                 "balance_error": figures["balance_error"],
             },
             "kinetic_to_internal": {
@@ -395,33 +429,35 @@ class _Loop:
 
 
 _SERIES = (
-    "external", "strain", "hourglass", "stabilisation", "kinetic", "added", "added_mass", "min_jacobian", "step_ratio",
-    "balance_error", "kinetic_ratio",
+    "external", "strain", "hourglass", "stabilisation", "kinetic", "added", "added_mass", "dissipated", "min_jacobian",
+    "step_ratio", "balance_error", "kinetic_ratio",
 )  # fmt: skip
 
 
 class _Progress:
     """How far the run is, on stderr: a bar on a terminal, a line every tenth elsewhere."""
 
-    def __init__(self, n_steps: int) -> None:
-        self.n_steps, self.begin, self.tenth, self.bar = n_steps, time.perf_counter(), 0, None
+    def __init__(self) -> None:
+        self.begin, self.tenth, self.bar = time.perf_counter(), 0, None
         if sys.stderr.isatty():
             try:
                 from tqdm import tqdm
             except ImportError:
                 return
-            self.bar = tqdm(total=n_steps, unit="step", dynamic_ncols=True)
+            self.bar = tqdm(total=1.0, bar_format="{percentage:3.0f}%|{bar}| {remaining} left{postfix}")
 
-    def show(self, step: int, figures: dict[str, float]) -> None:
-        state = f"kinetic/internal {figures['kinetic_ratio']:.1e}, min J {figures['min_jacobian']:.3f}"
+    def show(self, done: float, step: int, figures: dict[str, float]) -> None:
+        rate = step / max(time.perf_counter() - self.begin, 1e-9)
+        state = (
+            f"{rate:.0f} steps/s, kinetic/internal {figures['kinetic_ratio']:.1e}, min J {figures['min_jacobian']:.3f}"
+        )
         if self.bar is not None:
-            self.bar.update(step - self.bar.n)
-            self.bar.set_postfix_str(state)
-        elif 10 * step // self.n_steps > self.tenth:
-            self.tenth = 10 * step // self.n_steps
-            rate = step / (time.perf_counter() - self.begin)
-            left = (self.n_steps - step) / rate
-            print(f"{step / self.n_steps:4.0%}  {rate:6.0f} steps/s  {left:5.0f} s left  {state}", file=sys.stderr)
+            self.bar.set_postfix_str(state, refresh=False)
+            self.bar.update(max(0.0, done - self.bar.n))
+        elif int(10 * done) > self.tenth:
+            self.tenth = int(10 * done)
+            left = (1 - done) / done * (time.perf_counter() - self.begin)
+            print(f"{done:4.0%}  {left:5.0f} s left  {state}", file=sys.stderr, flush=True)
 
     def close(self) -> None:
         if self.bar is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,34 +21,43 @@ class State:
     u: NDArray[np.float64]  # (3, n_nodes + PADDING), m, at the time of `step`
     u_prev: NDArray[np.float64]  # (3, n_nodes + PADDING), m, one step before
     f: NDArray[np.float64]  # (3, n_nodes + PADDING), N, internal forces
-    mass: NDArray[np.float64]  # (n_nodes,), kg, as scaled
-    mobility: NDArray[np.float64]  # (n_nodes,), s^2/kg, dt^2 / mass
+    mass: NDArray[np.float64]  # (n_nodes,), kg, as scaled; in relaxation (6, n_nodes), its symmetric tensor
+    mobility: NDArray[np.float64]  # as mass, s^2/kg: dt^2 times its inverse
     reaction: NDArray[np.float64]  # (n owned moving dofs,), N
-    n_steps: int
+    load_time: float  # s
     time_step: float  # s
+    time: float = 0.0  # s
     step: int = 0
+    retain: float = 1.0  # share of the last step's motion that the next keeps in relaxation, and
+    gain: float = 1.0  # of the force that acts: see `kernels.relax`
     smallest_jacobian: float = 1.0  # of all steps so far
     external_work: float = 0.0  # J, of the moving dofs that this rank owns
+    free_work: float = 0.0  # J, of the internal forces at free dofs that this rank owns; counted in relaxation
 
     @property
     def share(self) -> float:
         """Share of the load time that has passed."""
-        return self.step / self.n_steps
+        return min(1.0, self.time / self.load_time)
+
+    @property
+    def next_load(self) -> float:
+        """Share of the full load after the next step."""
+        return loading_curve((self.time + self.time_step) / self.load_time)
 
 
 Term = tuple[str, Callable[[State], None]]
 
 
-def start(sub: Subdomain, n_steps: int, time_step: float) -> State:
-    """The state at rest."""
+def at_rest(sub: Subdomain, load_time: float, time_step: float) -> State:
+    """The undeformed state, with the model's masses."""
     u, u_prev, f = (np.zeros((3, sub.n_nodes + kernels.PADDING)) for _ in range(3))
     mass = sub.rows.mass.copy()
     owned_moving = int(np.count_nonzero(sub.rows.owned[sub.moving // 3]))
-    return State(u, u_prev, f, mass, time_step**2 / mass, np.zeros(owned_moving), n_steps, time_step)
+    return State(u, u_prev, f, mass, time_step**2 / mass, np.zeros(owned_moving), load_time, time_step)
 
 
-def compose(sub: Subdomain, halo: Halo | None) -> tuple[Term, ...]:
-    """The terms of a step, in order: forces of each kind of cell, the halo's sum, the reactions, the update."""
+def compose_forces(sub: Subdomain, halo: Halo | None) -> tuple[Term, ...]:
+    """The terms that make the nodal forces, in order: each kind of cell that is there, then the halo's sum."""
     terms: list[Term] = []
     runs, hexahedra, domains = sub.runs, sub.hexahedra, sub.domains
     if runs is not None:
@@ -70,127 +79,84 @@ def compose(sub: Subdomain, halo: Halo | None) -> tuple[Term, ...]:
         def support_domains(s: State) -> None:
             J = kernels.domain_forces(
                 s.u, s.f, domains.nodes, domains.gradient, domains.position, domains.inverse, domains.coefficient,
-                domains.members,
             )  # fmt: skip
             s.smallest_jacobian = min(s.smallest_jacobian, J)
 
         terms.append(("support domains", support_domains))
     if halo is not None:
         terms.append(("halo", lambda s: halo.sum(s.f)))
-    owned = sub.rows.owned[sub.moving // 3]
-    full, turns = sub.moving_full, sub.moving_turns
-    dofs, own_full, share = sub.moving[owned], full[owned], _share_of_load
-    if turns is not None:
-        ends, own_ends, own_turns = full, own_full, turns[owned]
-        full, own_full, share = full.copy(), own_full.copy(), _all
-
-        def motion(s: State) -> None:
-            target = _share_of_load(s)
-            kernels.follow(full, ends, turns, target)
-            kernels.follow(own_full, own_ends, own_turns, target)
-
-        terms.append(("motion", motion))
-    if len(dofs):
-
-        def reactions(s: State) -> None:
-            s.external_work += kernels.react(
-                s.u, s.u_prev, s.f, s.mass, dofs, own_full, share(s), s.reaction, s.time_step
-            )
-
-        terms.append(("reactions", reactions))
-
-    def update(s: State) -> None:
-        kernels.update(s.u, s.u_prev, s.f, s.mobility, sub.fixed, sub.moving, full, share(s))
-        s.u, s.u_prev = s.u_prev, s.u
-        s.step += 1
-
-    terms.append(("update", update))
     return tuple(terms)
 
 
-def _share_of_load(s: State) -> float:
-    """Share of the full load at the end of the step."""
-    return loading_curve((s.step + 1) / s.n_steps)
+@dataclass(frozen=True, slots=True)
+class _Motion:
+    """Where the moving dofs go next: a share of where they go at full load, or, on arcs, what a term has computed."""
+
+    full: NDArray[np.float64]  # (n moving dofs,), m
+    dofs: NDArray[np.uint32]  # (n owned moving dofs,)
+    own_full: NDArray[np.float64]  # m
+    share: Callable[[State], float]  # of full and own_full
+    terms: tuple[Term, ...]  # taken before the share is asked for
 
 
-def _all(s: State) -> float:
-    """Where `motion` has the displacements of the present step."""
-    return 1.0
+def _compose_motion(sub: Subdomain) -> _Motion:
+    owned = sub.rows.owned[sub.moving // 3]
+    full, turns = sub.moving_full, sub.moving_turns
+    dofs, own_full = sub.moving[owned], full[owned]
+    if turns is None:
+        return _Motion(full, dofs, own_full, lambda s: s.next_load, ())
+    ends, own_ends, own_turns = full, own_full, turns[owned]
+    full, own_full = full.copy(), own_full.copy()
+
+    def follow(s: State) -> None:
+        kernels.follow(full, ends, turns, s.next_load)
+        kernels.follow(own_full, own_ends, own_turns, s.next_load)
+
+    return _Motion(full, dofs, own_full, lambda s: 1.0, (("motion", follow),))
 
 
-@dataclass(slots=True)
-class Survey:
-    """Looks at all cells of a rank every few steps: energies, J, and the mass that the step needs for stability.
+def compose_march(sub: Subdomain) -> tuple[Term, ...]:
+    """The terms that move the nodes by their masses: the reactions where any dof moves, then the central difference."""
+    m = _compose_motion(sub)
 
-    The step is stable where each node's mass is at least dt^2 / 4 times the sum of its cells' largest eigenvalues, for
-    which the kernels give a bound in the present configuration; `safety` keeps the step that far below. Nodes that are
-    prescribed in every direction need no mass.
-    """
+    def reactions(s: State) -> None:
+        s.external_work += kernels.react(
+            s.u, s.u_prev, s.f, s.mass, m.dofs, m.own_full, m.share(s), s.reaction, s.time_step
+        )
 
-    sub: Subdomain
-    halo: Halo | None  # of one component
-    scales_mass: bool
-    safety: float
-    jacobian: NDArray[np.float64] = field(init=False)  # (n_cells + 1,), the last for lanes without a cell
-    required: NDArray[np.float64] = field(init=False)  # (1, n_nodes), kg
-    held: NDArray[np.uint32] = field(init=False)  # prescribed dofs
-    prescribed: NDArray[np.int64] = field(init=False)  # nodes prescribed in every direction
-    added_mass: float = 0.0  # kg, on owned nodes
-    added_energy: float = 0.0  # J
+    def update(s: State) -> None:
+        kernels.update(s.u, s.u_prev, s.f, s.mobility, sub.fixed, sub.moving, m.full, m.share(s))
+        _advance(s)
 
-    def __post_init__(self) -> None:
-        self.jacobian = np.ones(self.sub.n_cells + 1)
-        self.required = np.zeros((1, self.sub.n_nodes))
-        self.held = np.concatenate([self.sub.fixed, self.sub.moving])
-        nodes, directions = np.unique(self.held // 3, return_counts=True)
-        self.prescribed = nodes[directions == 3].astype(np.int64)
+    return (*m.terms, *((("reactions", reactions),) if len(m.dofs) else ()), ("update", update))
 
-    def look(self, s: State) -> dict[str, float]:
-        """This rank's share of the figures at the present step, for which the forces are in s.f.
 
-        Sums: "external", "strain", "hourglass", "stabilisation", "kinetic", "added" (J), "added_mass" (kg). Extremes:
-        "min_jacobian" (of all steps), "step_ratio" (the step over the one that the bound proves stable).
-        """
-        sub, required, jacobian = self.sub, self.required[0], self.jacobian
-        required[:] = 0
-        factor = (s.time_step / (2 * self.safety)) ** 2
-        strain = hourglass = stabilisation = 0.0
-        if (r := sub.runs) is not None:
-            strain, hourglass = kernels.voxel_survey(
-                s.u, r.start, r.length, r.first_cell, r.scale, r.coefficient, r.gram, required, factor, jacobian
-            )
-        if (h := sub.hexahedra) is not None:
-            more, resisted = kernels.hexahedron_survey(
-                s.u, h.nodes, h.cells, h.geometry, h.coefficient, h.gram, h.stiffness, required, factor, jacobian
-            )
-            strain += more
-            hourglass += resisted
-        if (d := sub.domains) is not None:
-            more, stabilisation = kernels.domain_survey(
-                s.u, d.nodes, d.cells, d.gradient, d.position, d.inverse, d.coefficient, d.gram, d.stiffness,
-                required, factor, jacobian, d.members,
-            )  # fmt: skip
-            strain += more
-        if self.halo is not None:
-            self.halo.sum(self.required)
-        required[self.prescribed] = 0
-        owned = sub.rows.owned
-        kinetic = kernels.kinetic_energy(s.u, s.u_prev, s.f, s.mass, owned, self.held, s.time_step)
-        s.smallest_jacobian = min(s.smallest_jacobian, float(jacobian[:-1].min()))
-        ratio = self.safety * float(np.sqrt((required / s.mass).max()))
-        if self.scales_mass:
-            mass, energy = kernels.raise_mass(s.u, s.u_prev, s.mass, s.mobility, required, owned, s.time_step)
-            self.added_mass += mass
-            self.added_energy += energy
-            ratio = min(ratio, self.safety)
-        return {
-            "external": s.external_work,
-            "strain": strain,
-            "hourglass": hourglass,
-            "stabilisation": stabilisation,
-            "kinetic": kinetic,
-            "added": self.added_energy,
-            "added_mass": self.added_mass,
-            "min_jacobian": s.smallest_jacobian,
-            "step_ratio": ratio,
-        }
+def compose_relaxation(sub: Subdomain, counted: NDArray[np.float64]) -> tuple[Term, ...]:
+    """As `compose_march`, damped, and with a mass tensor at each node; counted (3, n_nodes): see `kernels.relax`."""
+    m = _compose_motion(sub)
+
+    def reactions(s: State) -> None:
+        s.external_work += kernels.react(
+            s.u, s.u_prev, s.f, None, m.dofs, m.own_full, m.share(s), s.reaction, s.time_step
+        )
+
+    def relax(s: State) -> None:
+        s.free_work += kernels.relax(
+            s.u, s.u_prev, s.f, s.mobility, counted, sub.fixed, sub.moving, m.full, m.share(s), s.retain, s.gain
+        )
+        _advance(s)
+
+    return (*m.terms, *((("reactions", reactions),) if len(m.dofs) else ()), ("update", relax))
+
+
+def rehearse(s: State, terms: tuple[Term, ...]) -> None:
+    """Take the terms once without other ranks, so that their kernels are compiled or loaded from the disk's cache."""
+    for name, term in terms:
+        if name != "halo":
+            term(s)
+
+
+def _advance(s: State) -> None:
+    s.u, s.u_prev = s.u_prev, s.u
+    s.time += s.time_step
+    s.step += 1

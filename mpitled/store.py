@@ -55,6 +55,7 @@ _MODEL_ARRAYS = {
 
 
 def hdf5_version() -> str:
+    """Version of the HDF5 library that h5py was built on."""
     return str(h5py.version.hdf5_version)
 
 
@@ -66,10 +67,10 @@ def has_mpi() -> bool:
 # --- the model ---------------------------------------------------------------------------------------------------
 
 
-def write_model(path: Path, model: Model, key: str) -> None:
+def write_model(path: Path, model: Model, key: str, scene: Mapping[str, Any] | None = None) -> None:
     """Write the model to `path` at once or not at all; `key` says what it was built from (see `model_key`).
 
-    InputError if it cannot be written.
+    `scene` is the deck, for the export. InputError if it cannot be written.
 
     Arrays are contiguous, so that any range of rows is one read.
     """
@@ -80,11 +81,14 @@ def write_model(path: Path, model: Model, key: str) -> None:
         file.attrs["n_fe_nodes"] = model.n_fe_nodes
         for name, dtype in _MODEL_ARRAYS.items():
             file.create_dataset(name, data=np.asarray(getattr(model, name), dtype))
+        if model.surface_areas is not None:
+            file["surface_areas"] = model.surface_areas
         for name in ("node_sets", "cell_sets"):
             _write_sets(file.create_group(name), getattr(model, name))
         _write_json(file, "materials", [asdict(material) for material in model.materials])
         _write_json(file, "figures", model.figures)
         _write_json(file, "remarks", model.remarks)
+        _write_json(file, "scene", scene or {})
 
 
 def read_model(path: Path) -> Model:
@@ -95,6 +99,7 @@ def read_model(path: Path) -> Model:
             n_fe_nodes=int(file.attrs["n_fe_nodes"]),
             node_sets=_read_sets(file["node_sets"]),
             cell_sets=_read_sets(file["cell_sets"]),
+            surface_areas=file["surface_areas"][...] if "surface_areas" in file else None,
             materials=_read_materials(file),
             figures=_read_json(file, "figures"),
             remarks=tuple(_read_json(file, "remarks")),
@@ -122,6 +127,12 @@ def read_figures(path: Path) -> dict[str, Any]:
         return _read_json(file, "figures")
 
 
+def read_scene(path: Path) -> dict[str, Any]:
+    """The deck that the model was built from, in the deck's layout and units."""
+    with _open_model(path) as file:
+        return _read_json(file, "scene") if "scene" in file else {}
+
+
 def describe_model(path: Path) -> str:
     """Sizes, sets, materials and figures of a model, a line each."""
     with _open_model(path) as file:
@@ -142,6 +153,26 @@ def describe_model(path: Path) -> str:
         lines += [f"{name}: {value:.6g}" for name, value in _read_json(file, "figures").items()]
         lines += list(_read_json(file, "remarks")) if "remarks" in file else []
     return "\n".join(lines)
+
+
+def read_grid(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Places (n, 3) and volumes (n,) of a grid of integration points: datasets x, y, z, volume at the file's top."""
+    with _open(path) as file:
+        names = ("x", "y", "z", "volume")
+        if missing := [name for name in names if not isinstance(file.get(name), h5py.Dataset)]:
+            raise InputError(f"{path}: has no dataset '{missing[0]}'; give x, y, z and volume")
+        shapes = {file[name].shape for name in names}
+        shape = shapes.pop()
+        if shapes or len(shape) != 1 or any(file[name].dtype.kind not in "fiu" for name in names):
+            raise InputError(f"{path}: x, y, z and volume are not four lists of as many numbers; correct them")
+        # What was never written takes no room in the file, and must not here.
+        if shape[0] > 1000 * path.stat().st_size:
+            raise InputError(f"{path}: claims {shape[0]} points and has {path.stat().st_size} bytes; write it anew")
+        try:
+            columns = [file[name][...].astype(np.float64) for name in names]
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read as HDF5 ({str(error).splitlines()[0]})") from None
+    return np.stack(columns[:3], axis=1), columns[3]
 
 
 @contextmanager

@@ -55,11 +55,6 @@ class DomainBatches:
     gram: NDArray[np.floating]  # (n_batches, 6, lanes), 1/m^2
     stiffness: NDArray[np.floating]  # (n_batches, lanes), N/m
 
-    @property
-    def members(self) -> tuple[int, ...]:
-        """Places of a domain's nodes, a tuple whose length the compiler knows."""
-        return tuple(range(self.nodes.shape[1]))
-
 
 @dataclass(frozen=True, slots=True)
 class Subdomain:

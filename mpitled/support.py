@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpitled.errors import InputError
+from mpitled.hexahedra import nodal_sum
 
 #: Exponents of x, y, z: complete bases of 4, 10 and 20 monomials. The paper's 7 and 11 add cross terms only.
 POWERS = np.array([(i, j, d - i - j) for d in range(4) for i in range(d, -1, -1) for j in range(d - i, -1, -1)])
@@ -35,7 +36,6 @@ class Found:
     domains: NDArray[np.int64]  # (n_domains, n)
     limited: int  # domains that hold others than their nearest nodes because of a limit
     added: int  # nodes put into domains so that each wanted node is in enough of them
-    orphans: NDArray[np.int64]  # wanted nodes in no domain, ascending
 
 
 def find_domains(
@@ -79,14 +79,16 @@ def find_domains(
     if wanted is None:
         wanted = np.ones(len(points), bool)
     counts = np.bincount(domains.ravel(), minlength=len(points))
-    poor = np.flatnonzero(wanted & (counts < min_domains))
+    masks = np.array([mask for mask, _ in limits]).reshape(len(limits), len(points))
+    ceilings = np.array([limit for _, limit in limits], np.int64)
     added = 0
-    if len(poor) and len(at):
-        near = _nearest(cKDTree(at), points[poor], min(8 * min_domains, len(at)))
-        masks = np.array([mask for mask, _ in limits]).reshape(len(limits), len(points))
-        ceilings = np.array([limit for _, limit in limits], np.int64)
-        added = _widen(domains, counts, points, at, poor, near, wanted, masks, ceilings, min_domains)
-    return Found(domains, limited, added, np.flatnonzero(wanted & (counts == 0)))
+    # A node that is still in none takes the place of one that stays in at least one.
+    for least in (min_domains, min(min_domains, 1)):
+        poor = np.flatnonzero(wanted & (counts < least))
+        if len(poor) and len(at):
+            near = _nearest(cKDTree(at), points[poor], min(8 * min_domains, len(at)))
+            added += _widen(domains, counts, points, at, poor, near, wanted, masks, ceilings, least)
+    return Found(domains, limited, added)
 
 
 def _nearest(tree: cKDTree, at: NDArray[np.float64], k: int) -> NDArray[np.int64]:
@@ -256,7 +258,7 @@ def correct_consistency(
     and is the least change in the mean square over the volume; L (n_nodes, 3) solves a sparse symmetric system.
 
     nodes (G, n, 3) are the domains' places; fe_balance (n_nodes, 3) is the hexahedra's sum of V B; free (n_nodes,) are
-    nodes of domains that are not on the outer surface, not on the seed, and not prescribed.
+    nodes of domains where the surface's share, which fe_balance is less, is known.
     """
     n_nodes = len(free)
     residual = fe_balance + nodal_sum(domains, volumes[:, None, None] * gradients, n_nodes)
@@ -289,12 +291,6 @@ def correct_consistency(
         "consistency_after": after,
         "consistency_change": float(np.sqrt(((corrected - gradients) ** 2).sum() / (gradients**2).sum())),
     }
-
-
-def nodal_sum(cells: NDArray[np.int64], values: NDArray[np.float64], n_nodes: int) -> NDArray[np.float64]:
-    """Sum (n_nodes, 3) of the values (n_cells, n, 3) of cells at their nodes."""
-    flat = cells.ravel()
-    return np.stack([np.bincount(flat, values[..., i].ravel(), n_nodes) for i in range(3)], axis=1)
 
 
 def _assemble(cells: NDArray[np.int64], blocks: NDArray[np.float64], n_nodes: int) -> sparse.csr_matrix:

@@ -16,16 +16,16 @@ def main(deck: Path, directory: Path) -> None:
     world = World()
     loops = []
 
-    class Watched(runs._Loop):
+    class Watched(runs._Run):
         def __init__(self, *arguments: object) -> None:
             super().__init__(*arguments)  # type: ignore[arg-type]
             loops.append(self)
 
-    runs._Loop = Watched  # type: ignore[misc]
+    runs._Run = Watched  # type: ignore[misc]
     runs.run(load_deck(deck), directory, world, quiet=True)
-    state, shared = loops[0].state, loops[0].sub.shared
+    state, shared = loops[0].method.state, loops[0].sub.shared
     compared = 0
-    for values in (state.u, state.u_prev, state.mass[None]):
+    for values in (state.u, state.u_prev, np.atleast_2d(state.mass)):
         mine = {rank: np.ascontiguousarray(values[:, nodes]) for rank, nodes in shared}
         theirs = {rank: np.empty_like(block) for rank, block in mine.items()}
         requests = [world.comm.Irecv(block, rank) for rank, block in theirs.items()]

@@ -12,12 +12,12 @@ from mpitled.cloud import CLOSEST, Spacing, boundary_faces, cut, fill_void, subd
 from mpitled.errors import InputError
 from mpitled.mesh import grid_points, structured_hexahedra
 
-CLOUD = deck.Cloud(points_per_spacing=1.4)
+CLOUD = deck.Cloud(points_per_spacing=1.4, growth=0.3)
 SEED_VOLUME = 4 / 3 * np.pi * 0.002**3
 
 
 def tumour(centre, **keys):
-    return deck.Tumour(centre=centre, volume=523.6e-9, **keys)
+    return deck.Tumour(centre=centre, volume=523.6e-9, **{"surface_nodes": 400, **keys})
 
 
 def distorted_block(n=10, h=0.004):

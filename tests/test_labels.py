@@ -21,14 +21,14 @@ CENTRE = (-0.026, -0.070, 0.003)
 
 
 def tumour(centre=CENTRE):
-    return deck.Tumour(centre=centre, volume=523.6e-9)
+    return deck.Tumour(centre=centre, volume=523.6e-9, surface_nodes=400)
 
 
 @pytest.fixture(scope="module")
 def brain():
     """The shipped brain in 5 mm hexahedra, without a tumour and with one."""
     labels = deck.Labels(image=DATA / "mni152_labels_1mm.nii.gz", element_size=0.005)
-    cloud = deck.Cloud(points_per_spacing=1.4)
+    cloud = deck.Cloud(points_per_spacing=1.4, growth=0.3)
     return mesh_labels(labels, cloud, None), mesh_labels(labels, cloud, tumour())
 
 
@@ -132,7 +132,7 @@ def test_tumour_makes_a_void_in_tissue_only(brain):
 @pytest.mark.parametrize("element_size", [0.002, 0.003, 0.004])
 def test_the_tumour_of_the_decks_fits_at_every_element_size(element_size):
     labels = deck.Labels(image=DATA / "mni152_labels_2mm.nii.gz", element_size=element_size)
-    mesh = mesh_labels(labels, deck.Cloud(points_per_spacing=1.4), tumour())
+    mesh = mesh_labels(labels, deck.Cloud(points_per_spacing=1.4, growth=0.3), tumour())
     assert mesh.figures["void_volume_m3"] == pytest.approx(4 / 3 * np.pi * 0.018**3, rel=0.05)
     assert 2.4 < mesh.figures["integration_points_per_efg_node"] < 4
     assert n_pieces(mesh.hexahedra) == 1

@@ -15,7 +15,6 @@ from conftest import ENVIRONMENT, ROOT, complaint, mpitled, ranks, script
 from scipy.optimize import brentq
 
 from mpitled.loading import loading_curve
-from mpitled.run import LONGEST_UNWATCHED, schedule
 from mpitled.store import open_result
 
 #: A block that is stretched between two of its faces, which may slide: homogeneous whatever the mesh.
@@ -87,42 +86,76 @@ def test_loading_curve_rests_at_both_ends():
     assert 1 - d[-2] < 1.1e-8
 
 
-@pytest.mark.parametrize(
-    ("load_time", "step", "frames"), [(2.0, 2.5e-4, 10), (0.01, 1e-3, 3), (1.0, 0.3, 7), (1, 1, 1)]
-)
-def test_surveys_and_frames_fall_on_steps(load_time, step, frames):
-    n_steps, between, surveys = schedule(load_time, step, frames)
-    assert load_time / n_steps <= step * (1 + 1e-9)
-    assert n_steps == between * surveys * frames
-    assert 1 <= between <= LONGEST_UNWATCHED
-
-
-@pytest.mark.parametrize("cloud", ["none", "core", "all"])
-def test_homogeneous_stretch_has_its_closed_form(tmp_path, cloud):
-    """Hexahedra only, the mixed mesh and support domains only, from the same step: 20 % of uniaxial stretch.
-
-    Exact is x -> (l x, m y, m z) with P_yy = mu m + q l m = 0, q = lambda (J - 1) - mu / J. What is left is the
-    dynamics of the ramp, whose size the kinetic energy tells: for a stiffness of the same order as the loaded one,
-    the error relative to the stretch is at most the root of kinetic over internal energy (both quadratic).
-    """
-    path = deck(tmp_path, STRETCH, cloud=cloud, millimetres=6.0, load_time=0.5)
-    mpitled("run", path, "--out", tmp_path / "out")
-    E, nu, stretch = 3000.0, 0.49, 1.2
+def stretched(stretch: float) -> tuple[float, float]:
+    """Lateral stretch and J of x -> (l x, m y, m z) with P_yy = mu m + q l m = 0, q = lambda (J - 1) - mu / J."""
+    E, nu = 3000.0, 0.49
     lam, mu = E * nu / ((1 + nu) * (1 - 2 * nu)), E / (2 * (1 + nu))
 
     def lateral_stress(m: float) -> float:
         J = stretch * m * m
         return mu * m + (lam * (J - 1) - mu / J) * stretch * m
 
-    m = brentq(lateral_stress, 0.8, 1.0, xtol=1e-15)
+    m = float(brentq(lateral_stress, 0.8, 1.0, xtol=1e-15))
+    return m, stretch * m * m
+
+
+@pytest.mark.parametrize("cloud", ["none", "core", "all"])
+def test_homogeneous_stretch_has_its_closed_form(tmp_path, cloud):
+    """Hexahedra only, the mixed mesh and support domains only, from the same step: 20 % of uniaxial stretch.
+
+    What is left is the dynamics of the ramp, whose size the run tells: its distance to the static solution.
+    """
+    path = deck(tmp_path, STRETCH, cloud=cloud, millimetres=6.0, load_time=0.5)
+    mpitled("run", path, "--out", tmp_path / "out")
+    m, volume_ratio = stretched(1.2)
     with open_result(tmp_path / "out") as result:
-        kinetic = result.figures["kinetic_to_internal"]
-        assert kinetic["at_end"] < 1e-4
-        exact = result.points * [stretch - 1, m - 1, m - 1]
-        error = np.abs(result.point_data("displacement", -1) - exact).max()
+        figures = result.figures
+        exact = result.points * [0.2, m - 1, m - 1]
+        error = np.linalg.norm(result.point_data("displacement", -1) - exact, axis=1).max()
         J = result.in_cells("J", -1)
-    assert error < 6e-3 * max(np.sqrt(kinetic["at_end"]), 1e-3)
-    assert np.abs(J - stretch * m * m).max() < max(np.sqrt(kinetic["at_end"]), 1e-3)
+    assert figures["kinetic_to_internal"]["at_end"] < 1e-4
+    # The estimate is of the largest component, and honest to a factor of 3.
+    assert 1e3 * error < 3 * np.sqrt(3) * figures["static_distance_mm"]
+    assert figures["static_distance_mm"] < 0.1
+    # Strains are wrong by that distance over the shortest wave that the ramp excites, an edge of the block.
+    assert np.abs(J - volume_ratio).max() < 0.01
+
+
+@pytest.mark.parametrize("cloud", ["none", "core"])
+def test_relaxation_reaches_the_static_solution_in_few_steps(tmp_path, cloud):
+    """To the tolerance asked for, by its own estimate and in truth, in a fifth of the steps of a ramp."""
+    path = deck(tmp_path, STRETCH, cloud=cloud, millimetres=6.0, load_time=1.0)
+    steps = {}
+    for method in ("quasi-static", "dynamic-relaxation"):
+        mpitled(
+            "run", path, "--out", tmp_path / method, "--set", f"solver.method={method}", "--set",
+            "solver.load_steps=100", "--set", "solver.tolerance=1e-3",
+        )  # fmt: skip
+        with open_result(tmp_path / method) as result:
+            figures = result.figures
+            m, _ = stretched(1.2)
+            exact = result.points * [0.2, m - 1, m - 1]
+            error = np.abs(result.point_data("displacement", -1) - exact).max()
+            steps[method] = figures["steps"]
+            assert result.times[-1] == 1.0  # s, or the share of the load
+        assert figures["static_distance_mm"] < (1e-3 if method == "dynamic-relaxation" else 0.1)
+        assert 1e3 * error < 3 * figures["static_distance_mm"]
+    assert figures["energy_J"]["balance_error"] < 1e-3  # second order in the step at the load's fastest
+    assert 5 * steps["dynamic-relaxation"] < steps["quasi-static"]
+
+
+def test_a_wave_keeps_its_energy_while_the_step_shortens(tmp_path):
+    """Dynamic: a fast stretch and a hold. The step follows the deformed cells, and the ledger closes."""
+    path = deck(tmp_path, STRETCH, cloud="core", millimetres=15.0, load_time=0.02)
+    mpitled("run", path, "--out", tmp_path / "out", "--set", "solver.method=dynamic", "--set", "solver.hold_time=0.02")
+    with open_result(tmp_path / "out") as result:
+        figures, series, times = result.figures, result.series, result.times
+    assert times[-1] == 0.04
+    assert figures["energy_J"]["kinetic"] > 0.01 * figures["energy_J"]["internal"]  # waves, not statics
+    assert figures["energy_J"]["balance_error"] < 0.01
+    assert (series["step_ratio"] <= 1.0).all()
+    assert figures["added_mass_kg"] == 0
+    assert figures["time_step_s"] < 0.04 / figures["steps"]  # the last is shorter than the mean
 
 
 def final(directory: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -139,7 +172,9 @@ def test_one_two_and_four_ranks_agree_and_repeat(tmp_path):
     mpitled("run", path, "--out", tmp_path / "again", n=2)
     one = final(tmp_path / "1")
     largest = np.abs(one[0]).max()
-    assert largest == pytest.approx(3e-3, rel=0.01)  # R - r0
+    with open_result(tmp_path / "1") as result:
+        moved = np.linalg.norm(result.at_nodes("displacement", -1), axis=1).max()
+    assert moved == pytest.approx(3e-3, rel=1e-3)  # R - r0, the volume having four digits
     for n in (2, 4):
         for other, values in zip(final(tmp_path / str(n)), one, strict=True):
             assert np.abs(other - values).max() < 1e-8 * largest
@@ -148,7 +183,8 @@ def test_one_two_and_four_ranks_agree_and_repeat(tmp_path):
 
 
 def test_ranks_agree_to_round_off_in_the_linear_range(tmp_path):
-    path = deck(tmp_path, STRETCH, cloud="core", millimetres=0.01, load_time=0.1)
+    """A strain of 1/600: the round-off of I + grad u is 1e-13 of it, and some thousand steps add to that."""
+    path = deck(tmp_path, STRETCH, cloud="core", millimetres=0.05, load_time=0.1)
     for n in (1, 2, 4):
         mpitled("run", path, "--out", tmp_path / str(n), n=n)
     one = final(tmp_path / "1")[0]
@@ -165,8 +201,10 @@ def test_copies_of_shared_nodes_have_the_same_bits(tmp_path, n):
 
 def test_ranks_without_one_kind_of_cell(tmp_path):
     """A cloud at one end: of four parts some have no support domains, or no hexahedra."""
-    text = GROWTH.replace("[48.0, 40.0, 40.0]", "[96.0, 20.0, 20.0]").replace("[12, 10, 10]", "[24, 5, 5]")
-    text = text.replace("[24.0, 20.0, 20.0]", "[12.0, 10.0, 10.0]").replace("radius = 11.0", "radius = 9.0")
+    text = GROWTH.replace("[48.0, 40.0, 40.0]", "[240.0, 20.0, 20.0]").replace("[12, 10, 10]", "[60, 5, 5]")
+    text = text.replace("[24.0, 20.0, 20.0]", "[12.0, 10.0, 10.0]").replace(
+        "radius = 11.0", "radius = 9.0\ngrowth = 0.5\npoints_per_spacing = 1.2"
+    )
     path = deck(tmp_path, text, volume=60.0)
     for n in (1, 4):
         mpitled("run", path, "--out", tmp_path / str(n), n=n)
@@ -223,16 +261,22 @@ def test_more_ranks_than_cells_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("n", [1, 2])
-def test_an_unstable_run_stops_and_says_why(tmp_path, n):
+def test_a_step_above_the_critical_one_is_refused_with_the_one_to_use(tmp_path, n):
     path = deck(tmp_path, STRETCH, cloud="core", millimetres=3.0, load_time=1.0)
-    line = complaint(
-        mpitled(
-            "run", path, "--out", tmp_path / "out", "--set", "solver.time_step=3e-3", "--set",
-            "solver.mass_scaling=false", n=n, status=3,
-        )
-    )  # fmt: skip
-    assert "unstable" in line
-    assert "load_time" in line or "time_step" in line
+    run = ("run", path, "--out", tmp_path / "out", "--set", "solver.mass_scaling=false", "--set")
+    line = complaint(mpitled(*run, "solver.time_step=3e-3", n=n, status=2))
+    assert "solver.time_step = 0.003" in line
+    longest = float(line.split("give at most ")[1].split(",")[0])
+    mpitled(*run, f"solver.time_step={longest}", "--set", "solver.load_time=0.05", n=n)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_an_unstable_run_stops_and_says_why(tmp_path, n):
+    """A block pressed through itself: no step and no mass can save it."""
+    path = deck(tmp_path, STRETCH, cloud="core", millimetres=-45.0, load_time=0.1)
+    line = complaint(mpitled("run", path, "--out", tmp_path / "out", n=n, status=3))
+    for word in ("unstable at", "mm", "J = ", "rank", "brain", "load_time"):
+        assert word in line
     with open_result(tmp_path / "out") as result:
         assert not result.complete
         assert result.n_frames >= 1

@@ -1,0 +1,272 @@
+"""A model as decks: Abaqus files of the FE mesh and of the cloud, integration points as CSV, and the scene as TOML.
+
+Numbers are in SI units and the shortest decimals that are read as the same floats, in the model's order of nodes and
+cells: so what is read back is the same model, bit for bit.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpitled import store
+from mpitled.deck import GEOMETRIES
+from mpitled.errors import InputError
+from mpitled.meshfile import LARGEST_ID
+from mpitled.model import Model
+
+FE, EFG, GRID, AREAS, SCENE = "fe.inp", "efg.inp", "integration_points.csv", "surface_areas.csv", "scene.toml"
+#: Sections that the export writes anew: constraints are in the files, and materials go by sets that there are.
+_IN_FILES = ("material", "fixed", "displaced")
+_ROW = 16  # numbers in a line of a set
+_CHUNK = 1 << 16  # lines at once
+
+
+def write_abaqus(path: Path, directory: Path) -> list[Path]:
+    """Write the model of a file as decks into the directory; the paths written. InputError if it cannot be."""
+    model, scene = store.read_model(path), store.read_scene(path)
+    _check_names(path, model)
+    model = _named_materials(model)
+    ids = _numbers(model)
+    contents: dict[str, Iterable[str]] = {}
+    if model.n_fe_nodes:
+        contents[FE] = _fe(model, ids)
+    if len(model.domains):
+        contents[EFG] = _efg(model, ids)
+        contents[GRID] = _grid(model)
+        if model.surface_areas is not None:
+            contents[AREAS] = _areas(model.surface_areas, ids)
+    contents[SCENE] = _scene(model, scene, list(contents))
+    written = []
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        for name, lines in contents.items():
+            # Under another name first: a file that is there is whole.
+            temporary = directory / f".{name}.{os.getpid()}"
+            try:
+                with temporary.open("w", encoding="utf-8", newline="\n") as file:
+                    file.writelines(lines)
+                os.replace(temporary, directory / name)
+            finally:
+                temporary.unlink(missing_ok=True)
+            written.append(directory / name)
+    except OSError as error:
+        raise InputError(f"{error.filename or directory}: cannot be written ({error.strerror})") from None
+    return written
+
+
+def _check_names(path: Path, model: Model) -> None:
+    """InputError for names of sets that the decks cannot tell apart or hold."""
+    for sets in (model.node_sets, model.cell_sets):
+        names: dict[str, str] = {}
+        for name in sets:
+            other = names.setdefault(name.casefold(), name)
+            if other != name:
+                raise InputError(f"{path}: sets '{other}' and '{name}' are one to Abaqus; rename one")
+            if name != name.strip() or not name or any(mark in name for mark in '";\n\r'):
+                raise InputError(f"{path}: set {name!r} has a name that Abaqus cannot hold; rename it")
+
+
+def _numbers(model: Model) -> NDArray[np.int64]:
+    """Numbers of the nodes in the decks: their own where no two are the same, else rows."""
+    ids = model.node_ids
+    unique = len(np.unique(ids)) == len(ids) and ids.min() >= 1 and ids.max() <= LARGEST_ID
+    return ids if unique else np.arange(1, len(ids) + 1)
+
+
+def _named_materials(model: Model) -> Model:
+    """The model with cell sets of which each is of one material, and which make up all its cells."""
+    sets = dict(model.cell_sets)
+    for i, material in enumerate(model.materials):
+        cells = np.flatnonzero(model.material == i)
+        if len(cells) and not _sets_of(cells, sets):
+            name = f"material {material.name}"
+            while name in sets:
+                name += "_"
+            sets[name] = cells
+    return replace(model, cell_sets=sets)
+
+
+def _sets_of(cells: NDArray[np.int64], sets: dict[str, NDArray[np.int64]]) -> list[str]:
+    """Names of disjoint sets that are just these cells together; none if there are none such."""
+    chosen, left = [], np.zeros(int(cells.max(initial=-1)) + 1, bool)
+    left[cells] = True
+    inside = {name: members for name, members in sets.items() if len(members) and members[-1] < len(left)}
+    for name in sorted(inside, key=lambda name: -len(inside[name])):
+        if left[inside[name]].all():
+            chosen.append(name)
+            left[inside[name]] = False
+    return chosen if not left.any() else []
+
+
+# --- the decks -----------------------------------------------------------------------------------------------------
+
+
+def _fe(model: Model, ids: NDArray[np.int64]) -> Iterator[str]:
+    n, n_cells = model.n_fe_nodes, len(model.hexahedra)
+    yield "*HEADING\nFE mesh, in m, Pa, kg and s\n"
+    yield from _nodes(ids[:n], model.points[:n])
+    yield "*ELEMENT, TYPE=C3D8R\n"
+    yield from _rows(np.concatenate([np.arange(1, n_cells + 1)[:, None], ids[model.hexahedra]], axis=1))
+    yield from _all_sets("NSET", model.node_sets, ids, 0, n)
+    cell_ids = np.arange(1, n_cells + 1)
+    yield from _all_sets("ELSET", {k: v for k, v in model.cell_sets.items() if k != "all"}, cell_ids, 0, n_cells)
+    yield f"*ELSET, ELSET=all, GENERATE\n1, {n_cells}, 1\n"
+    for i, material in enumerate(model.materials):
+        for name in _sets_of(np.flatnonzero(model.material == i), model.cell_sets):
+            if len(model.cell_sets[name]) and model.cell_sets[name][0] < n_cells:
+                yield f"*SOLID SECTION, ELSET={_quoted(name)}, MATERIAL={_quoted(material.name)}\n"
+        yield f"*MATERIAL, NAME={_quoted(material.name)}\n*DENSITY\n{material.density!r}\n"
+        yield f"*ELASTIC\n{material.youngs_modulus!r}, {material.poissons_ratio!r}\n"
+    yield from _boundary(model, ids, 0, n)
+
+
+def _efg(model: Model, ids: NDArray[np.int64]) -> Iterator[str]:
+    n, n_nodes = model.n_fe_nodes, model.n_nodes
+    yield "*HEADING\nNodes of the cloud, in m\n"
+    yield from _nodes(ids[n:], model.points[n:])
+    yield from _all_sets("NSET", model.node_sets, ids, n, n_nodes)
+    yield from _boundary(model, ids, n, n_nodes)
+
+
+def _nodes(ids: NDArray[np.int64], points: NDArray[np.float64]) -> Iterator[str]:
+    yield "*NODE\n"
+    for first in range(0, len(ids), _CHUNK):
+        some = slice(first, first + _CHUNK)
+        rows = zip(ids[some].tolist(), points[some].tolist(), strict=True)
+        yield "".join(f"{number}, {x!r}, {y!r}, {z!r}\n" for number, (x, y, z) in rows)
+
+
+def _rows(numbers: NDArray[np.int64]) -> Iterator[str]:
+    for first in range(0, len(numbers), _CHUNK):
+        yield "".join(", ".join(map(str, row)) + "\n" for row in numbers[first : first + _CHUNK].tolist())
+
+
+def _all_sets(
+    keyword: str, sets: dict[str, NDArray[np.int64]], ids: NDArray[np.int64], first: int, stop: int
+) -> Iterator[str]:
+    """The sets' members among first to stop; sets without any are written where they begin, so that they are kept."""
+    for name, members in sets.items():
+        own = members[(members >= first) & (members < stop)]
+        if len(own) or (not len(members) and first == 0):
+            yield f"*{keyword}, {keyword}={_quoted(name)}\n"
+            numbers = ids[own]
+            full = len(numbers) // _ROW * _ROW
+            yield from _rows(numbers[:full].reshape(-1, _ROW))
+            if full < len(numbers):
+                yield from _rows(numbers[None, full:])
+
+
+def _boundary(model: Model, ids: NDArray[np.int64], first: int, stop: int) -> Iterator[str]:
+    """What is held, as model data, and what is moved, as a step: by sets where whole sets are, else by nodes."""
+    value = np.full((model.n_nodes, 3), np.nan)
+    value.ravel()[model.prescribed_dofs] = model.prescribed_displacements
+    value[:first] = np.nan
+    value[stop:] = np.nan
+    held: list[str] = []
+    moved: list[str] = []
+    singly: list[list[str]] = []  # of each set whose nodes move differently, so that it is read as that set again
+    for name, members in sorted(model.node_sets.items(), key=lambda item: -len(item[1])):
+        own = members[(members >= first) & (members < stop)]
+        rows = []
+        for direction in range(3) if len(own) else ():
+            values = value[own, direction].copy()
+            if np.isnan(values).any():
+                continue
+            if (values == values[0]).all():
+                line = f"{_quoted(name)}, {direction + 1}, {direction + 1}"
+                (held if values[0] == 0 else moved).append(f"{line}, {values[0].item()!r}\n")
+            else:
+                rows += _by_node(ids[own], direction, values)
+            value[own, direction] = np.nan
+        if rows:
+            singly.append(rows)
+    for direction in range(3):
+        left = np.flatnonzero(~np.isnan(value[:, direction]))
+        at = value[left, direction]
+        held += _by_node(ids[left[at == 0]], direction, at[at == 0])
+        moved += _by_node(ids[left[at != 0]], direction, at[at != 0])
+    if held:
+        yield "*BOUNDARY\n" + "".join(line.rpartition(", ")[0] + "\n" for line in held)
+    if moved or singly:
+        yield "*STEP, NLGEOM=YES\n*STATIC\n"
+        yield from ("*BOUNDARY\n" + "".join(rows) for rows in (moved, *singly) if rows)
+        yield "*END STEP\n"
+
+
+def _by_node(ids: NDArray[np.int64], direction: int, values: NDArray[np.float64]) -> list[str]:
+    degree = direction + 1
+    return [f"{n}, {degree}, {degree}, {at!r}\n" for n, at in zip(ids.tolist(), values.tolist(), strict=True)]
+
+
+def _grid(model: Model) -> Iterator[str]:
+    yield "x,y,z,volume,sets\n"
+    n = len(model.hexahedra)
+    names = [""] * len(model.domains)
+    for name, members in model.cell_sets.items():
+        if name != "all":
+            for point in (members[members >= n] - n).tolist():
+                names[point] += f";{name}"
+    rows = np.column_stack([model.domain_points, model.domain_volumes]).tolist()
+    for (x, y, z, volume), several in zip(rows, names, strict=True):
+        yield f"{x!r},{y!r},{z!r},{volume!r},{several[1:] or 'all'}\n"
+
+
+def _areas(areas: NDArray[np.float64], ids: NDArray[np.int64]) -> Iterator[str]:
+    yield "node,x,y,z\n"
+    there = np.flatnonzero((areas != 0).any(axis=1))
+    for number, (x, y, z) in zip(ids[there].tolist(), areas[there].tolist(), strict=True):
+        yield f"{number},{x!r},{y!r},{z!r}\n"
+
+
+def _quoted(name: str) -> str:
+    """A name as Abaqus has it: in quotation marks if it is more than letters, digits and underscores."""
+    return name if re.fullmatch(r"[A-Za-z_]\w*", name, re.ASCII) else f'"{name}"'
+
+
+# --- the scene -----------------------------------------------------------------------------------------------------
+
+
+def _scene(model: Model, scene: dict[str, Any], files: Sequence[str]) -> Iterator[str]:
+    """The deck that the model was built from, with these files in place of its geometry."""
+    yield "# Written by mpitled export. Fixed and displaced nodes are in the files of [mesh]; rotations are here too.\n"
+    yield from (f"{key} = {_toml(value)}\n" for key, value in scene.items() if not isinstance(value, dict | list))
+    yield "\n[mesh]\n"
+    for key, name in (("fe", FE), ("efg", EFG), ("integration_points", GRID), ("surface_areas", AREAS)):
+        if name in files:
+            yield f"{key} = {_toml(name)}\n"
+    yield 'unit = "m"\nmerge_tolerance = 0.0\n'
+    for section, table in scene.items():
+        if isinstance(table, dict) and section not in (*GEOMETRIES, "cloud", *_IN_FILES):
+            yield f"\n[{section}]\n"
+            yield from (f"{key} = {_toml(value)}\n" for key, value in table.items())
+    for entry in scene.get("displaced", ()):
+        if entry["rotation"]:  # the files know where it ends, not that it goes there along an arc
+            yield "\n[[displaced]]\n"
+            yield from (f"{key} = {_toml(value)}\n" for key, value in entry.items())
+    used: set[str] = set()
+    for i, material in enumerate(model.materials):
+        name = material.name
+        while name in used:
+            name += "_"
+        used.add(name)
+        sets = _sets_of(np.flatnonzero(model.material == i), model.cell_sets)
+        if sets:
+            yield f"\n[material.{_toml(name)}]\n"
+            yield f"youngs_modulus = {material.youngs_modulus!r}\npoissons_ratio = {material.poissons_ratio!r}\n"
+            yield f"density = {material.density!r}\ncells = {_toml(sets)}\n"
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    # JSON's strings, numbers and truth values are TOML's too.
+    return json.dumps(value, ensure_ascii=False)

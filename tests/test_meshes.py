@@ -1,0 +1,430 @@
+"""The mixed mesh of files, its checks, meshio's formats, the export, and the fuzz: all the way to a run."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import meshio
+import numpy as np
+import pytest
+from conftest import complaint, mpitled
+from decks import CLOUD, FLAT, void_decks
+from fuzz import fuzz
+
+from mpitled import hexahedra, meshes, overview, store, tables
+from mpitled.deck import MeshFiles, load_deck
+from mpitled.errors import InputError
+from mpitled.mesh import Mesh, grid_points, structured_hexahedra
+from mpitled.preprocess import build
+
+GROWTH = """
+title = "a tumour in a block"
+[block]
+size = [48.0, 40.0, 40.0]
+elements = [12, 10, 10]
+cloud = "core"
+[tumour]
+centre = [24.0, 20.0, 20.0]
+volume = 90.0
+[cloud]
+radius = 11.0
+[material.brain]
+youngs_modulus = 3000.0
+poissons_ratio = 0.49
+cells = ["hexahedra"]
+[material.cloud]
+youngs_modulus = 2500.0
+poissons_ratio = 0.45
+cells = ["cloud"]
+[[fixed]]
+nodes = "x0"
+[[displaced]]
+nodes = "x1"
+displacement = [0.7, 0.0, -0.3]
+rotation = 3.0
+axis = "x"
+centre = [0.0, 20.0, 20.0]
+[solver]
+load_time = 0.1
+[output]
+frames = 2
+"""
+
+
+@pytest.fixture
+def void(tmp_path: Path) -> Path:
+    """The folder of a mixed mesh: fe.inp, efg.inp, grid.csv and scene.toml."""
+    for name, text in void_decks().items():
+        (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+def warnings(mesh: Mesh) -> list[str]:
+    return [remark for remark in mesh.remarks if remark.startswith("warning")]
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+# ------------------------------------------------------------ the mixed mesh
+
+
+def test_the_cloud_is_merged_into_the_void(void):
+    mesh = meshes.read_mesh(load_deck(void / "scene.toml").mesh)
+    # 6^3 grid nodes less the 2^3 inside; the cloud repeats the 4^3 - 2^3 on the interface.
+    assert (mesh.n_fe_nodes, mesh.n_nodes) == (6**3 - 2**3, 6**3)
+    assert len(mesh.node_sets["interface"]) == 4**3 - 2**3
+    assert (mesh.node_sets["interface"] < mesh.n_fe_nodes).all()
+    assert any("56 nodes merged with FE nodes, 8 EFG nodes added" in remark for remark in mesh.remarks)
+    assert len(mesh.hexahedra) == 5**3 - 3**3
+    assert mesh.integration_volumes.sum() == pytest.approx(27e-9, rel=1e-14)
+    assert np.abs(mesh.points).max() == 5e-3
+    # Both keep the numbers of their files, FE first.
+    assert mesh.node_ids[0] == 1
+    assert mesh.node_ids[mesh.n_fe_nodes :].tolist() == [22, 23, 26, 27, 38, 39, 42, 43]
+    assert mesh.cell_sets["cloud"].tolist() == list(range(len(mesh.hexahedra), mesh.n_cells))
+    assert warnings(mesh) == []
+    model = build(load_deck(void / "scene.toml"))
+    assert model.mass.sum() == pytest.approx(125e-9 * 1000, rel=1e-12)
+    assert model.figures["consistency_after"] < 1e-13
+
+
+def test_units_are_each_file_s_own(void):
+    section = load_deck(void / "scene.toml").mesh
+    in_mm = meshes.read_mesh(section)
+    for name in ("efg.inp", "grid.csv"):
+        lines = []
+        for line in (void / name).read_text().splitlines():
+            fields = line.split(",")
+            if line[0].isdigit():
+                first = [fields.pop(0)] if name == "efg.inp" else []
+                scaled = [float(x) * (1e-3 if i < 3 else 1e-9) for i, x in enumerate(fields)]
+                line = ", ".join([*first, *map(repr, scaled)])
+            lines.append(line)
+        (void / name).write_text("\n".join(lines) + "\n")
+    edit(void / "scene.toml", 'unit = "mm"', 'unit = "mm"\nefg_unit = "m"\nintegration_unit = "m"')
+    in_m = meshes.read_mesh(load_deck(void / "scene.toml").mesh)
+    np.testing.assert_allclose(in_m.points, in_mm.points, rtol=1e-15)
+    np.testing.assert_allclose(in_m.integration_volumes, in_mm.integration_volumes, rtol=1e-14)
+
+
+def test_integration_points_from_dropped_hexahedra(void, tmp_path):
+    """Cut in k^3: as many points, the exact volume, and the sets and the material of the hexahedra that are gone."""
+    shape = (5, 5, 5)
+    points, cells = grid_points(shape, (5.0, 5.0, 5.0)), structured_hexahedra(shape)
+    centre = points[cells].mean(axis=1)
+    core = np.flatnonzero((np.abs(centre - 2.5) < 1.5).all(axis=1)) + 1
+    text = "*NODE\n" + "".join(f"{i}, {x}, {y}, {z}\n" for i, (x, y, z) in enumerate(points.tolist(), 1))
+    text += "*ELEMENT, TYPE=C3D8, ELSET=tissue\n"
+    text += "".join(", ".join(map(str, [i, *row])) + "\n" for i, row in enumerate((cells + 1).tolist(), 1))
+    text += "*ELSET, ELSET=core\n" + "".join(f"{n},\n" for n in core)
+    text += (
+        "*SOLID SECTION, ELSET=tissue, MATERIAL=brain\n*MATERIAL, NAME=brain\n*DENSITY\n1e-9\n*ELASTIC\n3e-3, 0.49\n"
+    )
+    (void / "fe.inp").write_text(text + "*NSET, NSET=skull\n1, 2, 3\n*BOUNDARY\nskull, 1, 3\n")
+    scene = void / "scene.toml"
+    edit(scene, 'integration_points = "grid.csv"', 'dropped = ["core"]\ncuts = 3\nstress_unit = "MPa"')
+    scene.write_text(scene.read_text().partition("[material.brain]")[0])
+    mesh = meshes.read_mesh(load_deck(scene).mesh)
+    assert len(mesh.hexahedra) == 5**3 - 3**3
+    assert len(mesh.integration_volumes) == 27 * 27
+    assert mesh.integration_volumes.sum() == pytest.approx(27e-9, rel=1e-13)
+    assert len(mesh.cell_sets["core"]) == 27 * 27
+    assert (mesh.cell_sets["core"] >= len(mesh.hexahedra)).all()
+    assert len(mesh.cell_sets["tissue"]) == mesh.n_cells
+    model = build(load_deck(scene))
+    (material,) = model.materials
+    # mm, MPa and t/mm^3.
+    assert (material.youngs_modulus, material.density) == pytest.approx((3000.0, 1000.0), rel=1e-14)
+
+
+def test_a_cloud_alone_of_tetrahedra(tmp_path):
+    (tmp_path / "cloud.inp").write_text(CLOUD)
+    mesh = meshes.read_mesh(MeshFiles(efg=tmp_path / "cloud.inp"))
+    assert (mesh.n_fe_nodes, mesh.n_nodes, len(mesh.integration_volumes)) == (0, 8, 6)
+    np.testing.assert_allclose(mesh.integration_volumes, 1 / 6, rtol=1e-14)
+    np.testing.assert_allclose(
+        mesh.integration_points[0], np.mean([[0, 0, 0], [1, 0, 0], [1, 1, 0], [1, 1, 1]], axis=0)
+    )
+    assert mesh.cell_sets["cloud"].tolist() == list(range(6))
+    assert mesh.node_sets["surface"].tolist() == list(range(8))
+
+
+def test_grids_in_hdf5_and_with_sets(void):
+    x, y, z, volume = np.loadtxt(void / "grid.csv", delimiter=",", skiprows=1).T
+    with h5py.File(void / "grid.h5", "w") as file:
+        file.update({"x": x, "y": y, "z": z, "volume": volume})
+    same = tables.read_grid(void / "grid.h5")
+    table = tables.read_grid(void / "grid.csv")
+    assert (same[0].tobytes(), same[1].tobytes()) == (table[0].tobytes(), table[1].tobytes())
+    lines = (void / "grid.csv").read_text().splitlines()
+    lines = ["x,y,z,volume,sets", lines[1] + ",a;b b", lines[2] + ",", lines[3] + ",a", *(x + ",c" for x in lines[4:])]
+    (void / "grid.csv").write_text("\n".join(lines))
+    sets = tables.read_grid(void / "grid.csv")[2]
+    assert sets["a"].tolist() == [0, 2]
+    assert sets["b b"].tolist() == [0]
+    mesh = meshes.read_mesh(load_deck(void / "scene.toml").mesh)
+    assert mesh.cell_sets["cloud"].tolist() == [len(mesh.hexahedra) + 1]  # what no set has
+
+
+def test_an_hdf5_file_that_claims_too_much_is_refused(void):
+    with h5py.File(void / "grid.h5", "w") as file:
+        for name in ("x", "y", "z", "volume"):
+            file.create_dataset(name, (10**12,), "f8", chunks=(1024,))
+    with pytest.raises(InputError, match="claims 1000000000000 points"):
+        tables.read_grid(void / "grid.h5")
+
+
+def test_constraints_and_materials_of_the_files_count_with_those_of_the_deck(void):
+    scene = void / "scene.toml"
+    model = build(load_deck(scene))
+    skull = model.node_sets["skull"]
+    np.testing.assert_array_equal(model.prescribed_dofs, (3 * skull[:, None] + np.arange(3)).ravel())
+    edit(scene, "displacement = [0.0]", "displacement = [1.0]")
+    with pytest.raises(
+        InputError, match=r"fe.inp: line \d+.*mm in x.*through .*displaced.0.*|displaced.0.*fe.inp: line"
+    ):
+        build(load_deck(scene))
+    edit(scene, "displacement = [1.0]", "displacement = [0.0]")
+    edit(scene, 'nodes = "skull"', 'nodes = "scull"')
+    with pytest.raises(InputError, match="no set 'scull'; sets: interface, skull"):
+        build(load_deck(scene))
+
+
+# ------------------------------------------------------------ checks
+
+
+def test_volumes_and_points_that_do_not_fit_the_void_are_warned_about(void):
+    scene = void / "scene.toml"
+    edit(void / "grid.csv", "0.125", "0.925")
+    (said,) = warnings(meshes.read_mesh(load_deck(scene).mesh))
+    assert "sum to 27.8 mm3, the void has 27 mm3" in said
+    edit(void / "grid.csv", "0.925", "0.125")
+    edit(void / "grid.csv", "1.25, 1.25, 1.25", "0.25, 1.25, 1.25")
+    (said,) = warnings(meshes.read_mesh(load_deck(scene).mesh))
+    assert "1 integration points lie in hexahedra" in said
+    edit(void / "grid.csv", "0.25, 1.25, 1.25, 0.125", "0.25, 1.25, 1.25, -0.125")
+    with pytest.raises(InputError, match=r"grid.csv: line 2: .* positive volume \(1 such\)"):
+        meshes.read_mesh(load_deck(scene).mesh)
+
+
+ORDERS = {
+    "inside out": [4, 5, 6, 7, 0, 1, 2, 3],
+    "mirrored": [0, 3, 2, 1, 4, 7, 6, 5],
+    "crosswise": [0, 1, 3, 2, 4, 5, 7, 6],
+    "crosswise, inside out": [4, 5, 7, 6, 0, 1, 3, 2],
+}
+
+
+@pytest.mark.parametrize("how", ORDERS)
+def test_wrong_node_orders_are_repaired_only_when_asked(tmp_path, how):
+    nodes = np.array([10, 20, 25, 15, 110, 120, 125, 115])[ORDERS[how]]
+    text = FLAT.replace("7, 10, 20, 25, 15, 110, 120, 125, 115", ", ".join(map(str, [7, *nodes])))
+    path = tmp_path / "deck.inp"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        meshes.read_mesh(MeshFiles(fe=path))
+    assert "line 17: 1 hexahedra are inverted or flat, the first is element 7; 1 have" in str(caught.value)
+    assert "mesh.repair = true" in str(caught.value)
+    mesh = meshes.read_mesh(MeshFiles(fe=path, repair=True))
+    assert any("1 hexahedra put in order" in remark for remark in mesh.remarks)
+    np.testing.assert_allclose(hexahedra.volumes(mesh.points, mesh.hexahedra), 1.0, rtol=1e-14)
+    assert hexahedra.scaled_jacobian(mesh.points, mesh.hexahedra).min() == pytest.approx(1.0)
+
+
+def test_flat_hexahedra_and_coincident_nodes(tmp_path):
+    path = tmp_path / "deck.inp"
+    flat = FLAT
+    for node in (110, 120, 115, 125):
+        row = next(line for line in FLAT.splitlines() if line.startswith(f" {node},"))
+        flat = flat.replace(row, row[: row.rindex(",")] + ", 1e-9")
+    path.write_text(flat)
+    with pytest.raises(InputError, match="1 hexahedra are inverted or flat, the first is element 7; correct"):
+        meshes.read_mesh(MeshFiles(fe=path))
+    path.write_text(FLAT.replace("*ELEMENT", "*NODE\n 1, 1., 0., 0.\n*ELEMENT").replace(" 3, 20,", " 3, 1,"))
+    said = overview.check(path)
+    assert "1 nodes lie where another one does, the first is node 1" in said
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("*DENSITY\n 1e-9,\n", "", "line 28: material brain has no density; 1000 kg/m3 is taken"),
+        ("left, 1, 3", "left, 2", "can move as a rigid body (1 of 6 motions)"),
+        (" 3, 20, 30, 35, 25, 120,", " 3, 21, 30, 35, 26, 121,", "the mesh is in 2 pieces that share no node"),
+        (" left, 1, 3", "** left", ""),
+    ],
+)
+def test_remarks_on_what_can_be_computed_and_should_not(tmp_path, old, new, words):
+    text = FLAT.replace(old, new)
+    if "pieces" in words:
+        text = text.replace(
+            "*ELEMENT", "*NODE\n 21, 1., 0., 0.\n 26, 1., 1., 0.\n 121, 1., 0., 1.\n 126, 1., 1., 1.\n*ELEMENT"
+        )
+        text = text.replace("121, 130, 135, 125", "121, 130, 135, 126")
+    (tmp_path / "deck.inp").write_text(text)
+    said = overview.check(tmp_path / "deck.inp")
+    assert words in said
+    if not words:
+        assert "rigid" in said  # right is moved along x only
+
+
+def test_a_node_fixed_and_displaced_at_once_is_an_error(tmp_path):
+    (tmp_path / "deck.inp").write_text(FLAT.replace(" left, 1, 3\n", " left, 1, 3\n left, 1, 1, 0.1\n"))
+    with pytest.raises(InputError, match=r"node 10 is moved by 100 mm in x, and by 0 mm .*\(4 such\)"):
+        overview.check(tmp_path / "deck.inp")
+
+
+def test_check_prints_what_is_in_a_file_and_in_a_deck(void):
+    (void / "flat.inp").write_text(FLAT)
+    printed = mpitled("check", void / "flat.inp").stdout
+    for line in (
+        "nodes            12",
+        "cells            hexahedron (C3D8R): 2",
+        "node set         left: 4",
+        "cell set         solid: 2",
+        "material         brain in solid: E 0.003, nu 0.49, density 1e-09",
+        "fixed            left (4 nodes) in x, y, z",
+        "displaced        right (4 nodes) in x by 0.25",
+    ):
+        assert line in printed.splitlines()
+    printed = mpitled("check", void / "scene.toml").stdout
+    for line in ("hexahedra        98", "integration      216 points, 27 mm3", "cell set         cloud: 216"):
+        assert line in printed.splitlines()
+    (void / "flat.inp").write_text(FLAT.replace("*BOUNDARY\n right", "*BOUNDARY\n wrong"))
+    line = complaint(mpitled("check", void / "flat.inp", status=2))
+    assert "there is no node set wrong; sets: everything, left, right" in line
+    assert "flat.inp: line" in line
+
+
+# ------------------------------------------------------------ meshio
+
+
+@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".msh", ".med", ".xdmf", ".mesh"])
+def test_what_meshio_reads_comes_in_with_its_sets(tmp_path, suffix):
+    points, cells = grid_points((2, 1, 1), (2.0, 1.0, 1.0)), structured_hexahedra((2, 1, 1))
+    part = np.array([1, 2], np.int32)
+    data = {"part": [part]}
+    if suffix == ".msh":
+        data = {"gmsh:physical": [part], "gmsh:geometrical": [part]}
+    elif suffix == ".med":
+        data = {"cell_tags": [-part]}
+    elif suffix == ".mesh":
+        data = {"medit:ref": [part]}
+    mesh = meshio.Mesh(points, [("hexahedron", cells)], cell_data=data)
+    if suffix == ".msh":
+        mesh.field_data = {"grey": np.array([1, 3]), "white": np.array([2, 3])}
+    elif suffix == ".med":
+        mesh.cell_tags = {-1: ["grey"], -2: ["white"]}
+    path = tmp_path / f"mesh{suffix}"
+    mesh.write(path, **({"file_format": "gmsh22"} if suffix == ".msh" else {}))
+    made = meshes.read_mesh(MeshFiles(fe=path))
+    np.testing.assert_array_equal(made.hexahedra, cells)
+    np.testing.assert_array_equal(made.points, points)
+    names = ["grey", "white"] if suffix in (".msh", ".med") else [f"{next(iter(data))} {i}" for i in (1, 2)]
+    assert [made.cell_sets[name].tolist() for name in names] == [[0], [1]]
+
+
+def test_what_meshio_cannot_read_is_one_line(tmp_path):
+    for name, text in (("a.vtu", "<VTKFile"), ("a.msh", "$MeshFormat\n4.1 0 8\n"), ("a.obj", "v"), ("a.txt", "hello")):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(InputError) as caught:
+            overview.check(tmp_path / name)
+        assert str(tmp_path / name) in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+# ------------------------------------------------------------ export
+
+
+def test_an_exported_model_runs_to_the_same_bits(tmp_path):
+    """Block, core cloud, tumour, fixed, displaced and turned sets, two materials: from decks as from the block."""
+    (tmp_path / "scene.toml").write_text(GROWTH)
+    mpitled("run", tmp_path / "scene.toml", "--out", tmp_path / "a")
+    printed = mpitled("export", tmp_path / "a", "--abaqus", "--out", tmp_path / "decks").stdout.split()
+    assert [Path(name).name for name in printed] == [
+        "fe.inp", "efg.inp", "integration_points.csv", "surface_areas.csv", "scene.toml",
+    ]  # fmt: skip
+    mpitled("run", tmp_path / "decks" / "scene.toml", "--out", tmp_path / "b")
+    models = [store.read_model(tmp_path / x / "model.h5") for x in "ab"]
+    for name in store._MODEL_ARRAYS:
+        one, other = (getattr(model, name) for model in models)
+        assert one.tobytes() == other.tobytes(), name
+    assert models[0].materials == models[1].materials
+    assert models[0].surface_areas.tobytes() == models[1].surface_areas.tobytes()
+    for kind in ("node_sets", "cell_sets"):
+        one, other = (getattr(model, kind) for model in models)
+        assert one.keys() == other.keys()
+        for name in one:
+            np.testing.assert_array_equal(one[name], other[name])
+    last = []
+    for x in "ab":
+        with store.open_result(tmp_path / x) as result:
+            last.append((result.at_nodes("displacement", -1), result.at_integration_points("displacement", -1)))
+    assert np.abs(last[0][0]).max() > 5e-4
+    for one, other in zip(*last, strict=True):
+        assert one.tobytes() == other.tobytes()
+
+
+@pytest.mark.parametrize("cloud", ["none", "all"])
+def test_an_exported_model_of_one_kind_of_cell_is_the_same(tmp_path, cloud):
+    text = GROWTH.partition("[tumour]")[0] + GROWTH[GROWTH.index("[material.brain]") :]
+    text = text.replace('"core"', f'"{cloud}"').replace('["hexahedra"]', '["all"]')
+    head, _, rest = text.partition("[material.cloud]")
+    (tmp_path / "scene.toml").write_text(head + rest[rest.index("[[fixed]]") :])
+    mpitled("build", tmp_path / "scene.toml", "--out", tmp_path / "a")
+    mpitled("export", tmp_path / "a" / "model.h5", "--abaqus")
+    mpitled("build", tmp_path / "a" / "export" / "scene.toml", "--out", tmp_path / "b")
+    models = [store.read_model(tmp_path / x / "model.h5") for x in "ab"]
+    for name in store._MODEL_ARRAYS:
+        one, other = (getattr(model, name) for model in models)
+        assert one.tobytes() == other.tobytes(), name
+
+
+def test_a_changed_include_builds_the_model_anew(tmp_path):
+    (tmp_path / "nodes.inp").write_text(FLAT[: FLAT.index("*ELEMENT")])
+    (tmp_path / "fe.inp").write_text("*INCLUDE, INPUT=nodes.inp\n" + FLAT[FLAT.index("*ELEMENT") :])
+    (tmp_path / "scene.toml").write_text('[mesh]\nfe = "fe.inp"\nunit = "mm"\nstress_unit = "MPa"\n')
+    out = lambda: mpitled("build", tmp_path / "scene.toml", "--out", tmp_path / "out").stdout.splitlines()[0]  # noqa: E731
+    assert out().endswith("built")
+    assert out().endswith("up to date")
+    edit(tmp_path / "nodes.inp", "2., 1., 1.", "2., 1., 1.5")
+    assert out().endswith("built")
+
+
+# ------------------------------------------------------------ all together
+
+
+def test_mutated_decks_end_in_a_mesh_or_one_line():
+    """`python tests/fuzz.py` is the long form."""
+    ends = fuzz(400, first=1_000_000)
+    assert ends["broken"] == 0
+    assert ends["mesh"] > 40
+    assert ends["error"] > 40
+
+
+@pytest.mark.study
+def test_a_million_hexahedra_are_read_in_twenty_seconds_and_a_gibibyte(tmp_path):
+    shape = (100, 100, 100)
+    points = grid_points(shape, (100.0, 100.0, 100.0)) + np.random.default_rng(0).uniform(-0.1, 0.1, (101**3, 3))
+    with (tmp_path / "big.inp").open("w") as file:
+        file.write("*NODE\n")
+        file.writelines(f"{i}, {x:.9g}, {y:.9g}, {z:.9g}\n" for i, (x, y, z) in enumerate(points.tolist(), 1))
+        file.write("*ELEMENT, TYPE=C3D8R, ELSET=tissue\n")
+        rows = (structured_hexahedra(shape) + 1).tolist()
+        file.writelines(f"{i}, {', '.join(map(str, row))}\n" for i, row in enumerate(rows, 1))
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    command = [str(Path(sys.executable).with_name("mpitled")), "check", str(tmp_path / "big.inp")]
+    assert "hexahedron (C3D8R): 1000000" in subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    print(f"{seconds:.1f} s of CPU time, {after.ru_maxrss / 2**20:.2f} GiB")
+    assert seconds < 20
+    assert after.ru_maxrss < 2**20
