@@ -22,8 +22,14 @@ def sphere_radius(volume: float) -> float:
 def growth(
     points: NDArray[np.float64], centre: NDArray[np.float64], seed_radius: float, volume: float
 ) -> NDArray[np.float64]:
-    """Displacement (n, 3), m at full load, of nodes on the seed's surface: radially, to the sphere of that volume."""
-    return (sphere_radius(volume) / seed_radius - 1) * (points - centre)
+    """Displacement (n, 3), m at full load, of nodes on the seed's surface: radially, to the sphere of that volume.
+
+    Nodes that are not quite on it, as in a mesh that takes no notice of the seed, move as incompressible tissue there
+    would: the cube of the distance grows by R^3 - r0^3.
+    """
+    cubed = ((points - centre) ** 2).sum(axis=1) ** 1.5
+    grown = np.cbrt(cubed + sphere_radius(volume) ** 3 - seed_radius**3)
+    return (grown / np.cbrt(cubed) - 1)[:, None] * (points - centre)
 
 
 def turn(points: NDArray[np.float64], rotation: Rotation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

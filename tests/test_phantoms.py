@@ -171,6 +171,20 @@ def test_a_hexahedron_is_the_seed_of_the_papers_mesh():
     assert hexahedra.scaled_jacobian(mesh.points, mesh.hexahedra).min() > 0.4
 
 
+def test_nodes_beside_the_seed_move_as_incompressible_tissue():
+    """To R from the seed; from elsewhere so that every shell keeps its volume, whichever way it lies."""
+    rng, centre, volume = np.random.default_rng(1), np.array(TUMOUR.centre), 523.6e-9
+    direction = rng.normal(size=(200, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    radius = np.where(np.arange(200) % 2, 0.002, rng.uniform(0.001, 0.02, 200))
+    points = centre + radius[:, None] * direction
+    grown = points + loading.growth(points, centre, 0.002, volume) - centre
+    after = np.linalg.norm(grown, axis=1)
+    np.testing.assert_allclose(4 / 3 * np.pi * (after**3 - radius**3), volume - SEED_VOLUME, rtol=1e-9)
+    np.testing.assert_allclose(grown / after[:, None], direction, atol=1e-12)
+    np.testing.assert_allclose(after[1::2], loading.sphere_radius(volume), rtol=1e-12)
+
+
 def test_a_seed_needs_room():
     with pytest.raises(InputError, match=r"tumour.centre = \(75, 0, 8\) mm: seed and an element's size"):
         ellipsoid(tumour=deck.Tumour(centre=(0.075, 0.0, 0.008), volume=523.6e-9))
