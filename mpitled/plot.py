@@ -292,7 +292,7 @@ def draw_study(rows: list[dict[str, Any]], path: Path, error: str) -> None:
     families = list(dict.fromkeys(row["family"] for row in done))
     for i, family in enumerate(families):
         points = [(row["loop_s"], row["max_error_mm"], row["value"]) for row in done if row["family"] == family]
-        style = {"color": _FAMILIES[i % len(_FAMILIES)], "marker": _MARKERS[i % len(_MARKERS)]}
+        style: dict[str, Any] = {"color": _FAMILIES[i % len(_FAMILIES)], "marker": _MARKERS[i % len(_MARKERS)]}
         axes.plot([x for x, _, _ in points], [y for _, y, _ in points], label=family, linewidth=0.8, **style)
         for x, y, value in points:
             axes.annotate(value, (x, y), xytext=(5, 4), textcoords="offset points", fontsize=7, color=style["color"])

@@ -6,6 +6,7 @@ import csv
 import hashlib
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -44,7 +45,8 @@ class Variant:
 def variants(vary: Sequence[str], base: Sequence[str]) -> Iterator[Variant]:
     """The scene as it is, then each "key=a,b,c" in turn, one key at a time; the key "ranks" is the number of ranks.
 
-    Several keys that go together are joined by "+": "a=1,2+b=3,4" is a = 1, b = 3, then a = 2, b = 4.
+    A list is a value: "block.elements=[4,4,4],[8,8,8]". Keys that go together are joined by "+": "a=1,2+b=3,4" is
+    a = 1, b = 3, then a = 2, b = 4.
     """
     yield Variant("as it is", "", tuple(base), 1)
     for text in vary:
@@ -54,7 +56,7 @@ def variants(vary: Sequence[str], base: Sequence[str]) -> Iterator[Variant]:
             if not equals or not key.strip() or not values.strip():
                 raise InputError(f"--vary {text}: is not key=value,value,...; write for example cloud.growth=0.15,0.2")
             keys.append(key.strip())
-            columns.append([value.strip() for value in values.split(",")])
+            columns.append([value.strip() for value in re.split(r",(?![^\[]*\])", values)])
         if len({len(column) for column in columns}) > 1:
             raise InputError(f"--vary {text}: keys that go together need as many values each")
         for chosen in zip(*columns, strict=True):

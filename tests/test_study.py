@@ -22,24 +22,26 @@ def test_a_study_goes_on_where_it_stopped_and_tells_errors_and_failures(tmp_path
     arguments = [
         "study", CUBE, "--out", out, "--reference", REFERENCE, "--set", "solver.method=dynamic-relaxation",
         "--set", "block.elements=[4,4,4]", "--vary", "solver.tolerance=0.1,0.001",
-        "--vary", "solver.load_steps=200,1+ranks=2,1",
+        "--vary", "block.elements=[4,4,4],[2,2,2]+ranks=2,1", "--vary", "solver.load_steps=1",
     ]  # fmt: skip
     first = mpitled(*arguments)
-    assert first.stderr.count("/5: ") == 5
+    assert first.stderr.count("/6: ") == 6
     table = rows(out)
     assert [(row["family"], row["value"], row["ranks"]) for row in table] == [
         ("as it is", "", "1"),
         ("solver.tolerance", "0.1", "1"),
         ("solver.tolerance", "0.001", "1"),
-        ("solver.load_steps+ranks", "200 2", "2"),
-        ("solver.load_steps+ranks", "1 1", "1"),
+        ("block.elements+ranks", "[4,4,4] 2", "2"),
+        ("block.elements+ranks", "[2,2,2] 1", "1"),
+        ("solver.load_steps", "1", "1"),
     ]
     done, failed = table[:-1], table[-1]
     assert "unstable" in failed["failure"]  # half the height in one step
     assert failed["max_error_mm"] == ""
     for row in done:
         assert float(row["max_error_mm"]) < 3 * float(row["static_distance_mm"])
-        assert int(row["cell_updates"]) == 64 * int(row["steps"])
+        assert int(row["cell_updates"]) == int(row["cells"]) * int(row["steps"])
+    assert [int(row["cells"]) for row in done[-2:]] == [64, 8]
     assert int(done[1]["steps"]) < int(done[2]["steps"])
     errors = [(float(row["max_error_mm"]), float(row["loop_s"])) for row in done]
     for row, (error, seconds) in zip(done, errors, strict=True):
@@ -50,7 +52,7 @@ def test_a_study_goes_on_where_it_stopped_and_tells_errors_and_failures(tmp_path
     removed = next(out.glob("solver.tolerance-0.1-*"))
     shutil.rmtree(removed)
     again = mpitled(*arguments)
-    assert again.stderr.count("/5: ") == 1
+    assert again.stderr.count("/6: ") == 1
     assert removed.exists()
 
 
