@@ -202,9 +202,8 @@ def test_copies_of_shared_nodes_have_the_same_bits(tmp_path, n):
 def test_ranks_without_one_kind_of_cell(tmp_path):
     """A cloud at one end: of four parts some have no support domains, or no hexahedra."""
     text = GROWTH.replace("[48.0, 40.0, 40.0]", "[240.0, 20.0, 20.0]").replace("[12, 10, 10]", "[60, 5, 5]")
-    text = text.replace("[24.0, 20.0, 20.0]", "[12.0, 10.0, 10.0]").replace(
-        "radius = 11.0", "radius = 9.0\ngrowth = 0.5\npoints_per_spacing = 1.2"
-    )
+    text = text.replace("[24.0, 20.0, 20.0]", "[12.0, 10.0, 10.0]").replace("[cloud]", "surface_nodes = 100\n[cloud]")
+    text = text.replace("radius = 11.0", "radius = 9.0\ngrowth = 0.5\npoints_per_spacing = 1.2")
     path = deck(tmp_path, text, volume=60.0)
     for n in (1, 4):
         mpitled("run", path, "--out", tmp_path / str(n), n=n)
@@ -312,8 +311,8 @@ def test_the_death_of_one_rank_ends_the_others(tmp_path):
         while not file.exists() and time.time() < deadline:
             time.sleep(0.1)
         time.sleep(0.5)
-        children = subprocess.run(["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, text=True)
-        os.kill(int(children.stdout.split()[0]), signal.SIGKILL)
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        os.kill(int(children[0]), signal.SIGKILL)
         assert process.wait(timeout=30) != 0
 
 
