@@ -283,6 +283,12 @@ def _sides(axes: Any, solid: Solid) -> None:
         axes.text(x, 0.97, letter, transform=axes.transAxes, ha="center", va="top", fontsize=14, fontweight="bold")
 
 
+def _plain(value: float, _: Any) -> str:
+    """A tick of a logarithmic axis as a plain number; of those between the powers of ten only some."""
+    text = f"{value:g}"
+    return text if text.strip("0.")[:1] in ("1", "2", "3", "5", "7") else ""
+
+
 def draw_study(rows: list[dict[str, Any]], path: Path, error: str) -> None:
     """Error against loop time of the runs of a study, a line for each family, the best ringed (Pareto)."""
     figure = Figure(figsize=(9, 6), layout="constrained")
@@ -302,6 +308,10 @@ def draw_study(rows: list[dict[str, Any]], path: Path, error: str) -> None:
         markerfacecolor="none", label="none is better in both (Pareto)",
     )  # fmt: skip
     axes.set(xscale="log", yscale="log", xlabel="time of the loop, s", ylabel=error)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(_plain)
+        axis.set_minor_formatter(_plain)
+    axes.margins(0.12)
     axes.grid(True, which="both", linewidth=0.3)
     axes.legend(fontsize=8)
     figure.savefig(path, dpi=150)
