@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import hashlib
 import json
 import math
@@ -16,7 +17,6 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
-from mpitled import __version__
 from mpitled.errors import InputError
 from mpitled.material import Material
 from mpitled.mesh import Constraint, Rotation
@@ -676,15 +676,24 @@ _MODEL = (*GEOMETRIES, "tumour", "cloud", "support", "hexahedra", "materials", "
 
 
 def model_key(deck: Deck, included: Sequence[Path] = ()) -> str:
-    """What determines the model, as canonical JSON: this version, values in SI units, files by their SHA-256.
+    """What determines the model, as canonical JSON: this program, values in SI units, files by their SHA-256.
 
     `included` are files that those of the deck read in turn.
     """
     sections = asdict(deck)
-    content: dict[str, Any] = {"mpitled": __version__} | {name: sections[name] for name in _MODEL}
+    content: dict[str, Any] = {"program": _program()} | {name: sections[name] for name in _MODEL}
     if included:
         content["included"] = list(included)
     return json.dumps(content, sort_keys=True, separators=(",", ":"), default=_digest)
+
+
+@functools.cache
+def _program() -> str:
+    """This program by its sources: a model that others built may differ from what they would build."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return f"sha256:{digest.hexdigest()}"
 
 
 def _digest(path: Path) -> str:
