@@ -7,15 +7,13 @@ import hashlib
 import json
 import os
 import re
-import shutil
-import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mpitled import compare
+from mpitled import compare, launch
 from mpitled.deck import load_deck
 from mpitled.errors import InputError
 
@@ -83,53 +81,26 @@ def study(
     rows = []
     for i, variant in enumerate(todo, 1):
         folder = out / variant.folder
-        if not (folder / "done.json").exists():
+        if (failure := launch.outcome(folder)) is None:
             print(f"{i}/{len(todo)}: {variant.family} {variant.value}", file=sys.stderr, flush=True)
-            _run(deck, variant, folder)
-        rows.append(_row(variant, json.loads((folder / "done.json").read_text()), folder, reference, beyond))
+            failure = launch.run_apart(deck, variant.overrides, variant.ranks, folder)
+        rows.append(_row(variant, failure, folder, reference, beyond))
     for row in rows:
         row["pareto"] = _is_best(row, rows)
     _write_table(out / "study.csv", rows)
     try:
-        from mpitled import plot
+        from mpitled import charts
     except ImportError:
         print(f"{out}: no picture, for matplotlib is missing", file=sys.stderr)
     else:
-        plot.draw_study(rows, out / "study.png", "largest error, mm" if reference else "estimated error, mm")
+        charts.draw_study(rows, out / "study.png", "largest error, mm" if reference else "estimated error, mm")
     return rows
 
 
-def _run(deck: Path, variant: Variant, folder: Path) -> None:
-    """Compute a variant in its folder; done.json says that it ended, and how."""
-    shutil.rmtree(folder, ignore_errors=True)
-    command = [
-        sys.executable,
-        "-c",
-        "from mpitled.cli import main; main()",
-        "run",
-        str(deck),
-        "-q",
-        "--out",
-        str(folder),
-    ]
-    command += [word for override in variant.overrides for word in ("--set", override)]
-    if variant.ranks > 1:
-        command = ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(variant.ranks), *command]
-    ended = subprocess.run(command, capture_output=True, text=True)
-    lines = [line for line in ended.stderr.splitlines() if line.startswith("mpitled: ")]
-    failure = "" if ended.returncode == 0 else (lines or ended.stderr.splitlines() or ["no reason given"])[-1]
-    folder.mkdir(parents=True, exist_ok=True)
-    temporary = folder / ".done.json"
-    temporary.write_text(json.dumps({"failure": failure.removeprefix("mpitled: ")}))
-    os.replace(temporary, folder / "done.json")
-
-
-def _row(
-    variant: Variant, done: dict[str, str], folder: Path, reference: Path | None, beyond: float | None
-) -> dict[str, Any]:
+def _row(variant: Variant, failure: str, folder: Path, reference: Path | None, beyond: float | None) -> dict[str, Any]:
     row: dict[str, Any] = dict.fromkeys(COLUMNS, "")
-    row |= {"family": variant.family, "value": variant.value, "ranks": variant.ranks, "failure": done["failure"]}
-    if done["failure"]:
+    row |= {"family": variant.family, "value": variant.value, "ranks": variant.ranks, "failure": failure}
+    if failure:
         return row
     report = json.loads((folder / "report.json").read_text())
     cells = sum(report["cells"].values())
