@@ -780,27 +780,28 @@ def change_step(u, u_prev, f, mobility, ratio):  # type: ignore[no-untyped-def]
             u_prev[c, n] = now - ratio * (now - u_prev[c, n]) + (gain - 1) * mobility[n] * f[c, n]
 
 
-@njit(cache=True)
-def kinetic_energy(u, u_prev, f, mass, counted, held, time_step):  # type: ignore[no-untyped-def]
+@_kernel
+def kinetic_energy(u, u_prev, f, mass, mobility, counted, held, time_step):  # type: ignore[no-untyped-def]
     """Kinetic energy (J) of the counted nodes at the middle of the two half steps around u.
 
     held (n,) are the prescribed dofs: theirs is taken from the last half step, for f does not move them.
-    No fast arithmetic here: a NaN anywhere must come out as NaN.
     """
-    energy = 0.0
+    half = u.dtype.type(0.5)
+    twice = 0.0
     for c in range(3):
-        for n in range(counted.size):
-            if counted[n]:
-                v = (u[c, n] - u_prev[c, n]) / time_step - 0.5 * time_step * f[c, n] / mass[n]
-                energy += 0.5 * mass[n] * v * v
+        now = u[c]
+        before = u_prev[c]
+        fc = f[c]
+        for n in range(U(mass.size)):
+            v = now[n] - before[n] - half * mobility[n] * fc[n]
+            twice += counted[n] * mass[n] * v * v
     for p in range(held.size):
         n = held[p] // 3
         c = held[p] % 3
-        if counted[n]:
-            v = (u[c, n] - u_prev[c, n]) / time_step
-            w = v - 0.5 * time_step * f[c, n] / mass[n]
-            energy += 0.5 * mass[n] * (v * v - w * w)
-    return energy
+        v = u[c, n] - u_prev[c, n]
+        w = v - half * mobility[n] * f[c, n]
+        twice += counted[n] * mass[n] * (v * v - w * w)
+    return 0.5 * twice / (time_step * time_step)
 
 
 @njit(cache=True)

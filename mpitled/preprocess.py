@@ -90,7 +90,6 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
     # Next to a seed the cloud is fine: a few heavier nodes there cost less than its short step everywhere.
     in_cloud = np.isin(loose, domains) if len(loose) else np.zeros(len(points), bool)
     figures |= {
-        "critical_step_min_s": float(critical.min()),
         "critical_step_typical_s": float(np.median(critical if in_cloud.all() else critical[~in_cloud])),
         "mass_kg": float(cell_mass.sum()),
         "volume_m3": float(fe_volumes.sum() + volumes.sum()),

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from mpitled import kernels
 from mpitled.deck import Solver
-from mpitled.halo import Halo
+from mpitled.halo import Halo, World
+from mpitled.sharpness import Sharpness
 from mpitled.step import State, at_rest, compose_forces, compose_relaxation, rehearse
 from mpitled.subdomain import Subdomain
 from mpitled.survey import Survey
@@ -34,7 +35,15 @@ class Relaxation:
     speed over its frequency and as its acceleration over its frequency squared, whichever is more.
     """
 
-    def __init__(self, solver: Solver, frames: int, sub: Subdomain, force_halo: Halo | None, halo: Halo | None) -> None:
+    def __init__(
+        self,
+        solver: Solver,
+        frames: int,
+        sub: Subdomain,
+        world: World,
+        force_halo: Halo | None,
+        halo: Halo | None,
+    ) -> None:
         """halo sums six components."""
         self.sub, self.halo, self.safety, self.frames = sub, halo, solver.safety, frames
         self.tolerance = solver.tolerance
@@ -44,13 +53,12 @@ class Relaxation:
         self.state.mobility = np.zeros((6, sub.n_nodes))
         self.survey = Survey(sub)
         self.required = np.zeros((6, sub.n_nodes))
-        self.free = np.ones((3, sub.n_nodes))
-        for held in (sub.fixed, sub.moving):
-            self.free[held % 3, held // 3] = 0
+        self.free = sub.free()
         self.counted: NDArray[np.float64] = self.free * sub.rows.owned  # free dofs that this rank owns
         self.u_then, self.f_then = np.zeros((3, sub.n_nodes)), np.zeros((3, sub.n_nodes))
         self.lowest, self.distance, self.frame, self.settled = 0.0, math.inf, 0, 0
         self.forces, self.motion = compose_forces(sub, force_halo), compose_relaxation(sub, self.counted)
+        self.sharpness = Sharpness(sub, world, self.forces, self.free)
 
     def start_from(self, s: State, energy: float) -> None:
         """Go on from the displacements of another run at the end of its load, at rest; `energy` (J) is in its cells."""
@@ -59,6 +67,10 @@ class Relaxation:
         self.u_then[:] = s.u[:, : self.sub.n_nodes]
         self.state.external_work = energy
         self.frame = self.frames
+
+    def begin(self) -> None:
+        """Find how sharp the bound of stiffness is. Collective."""
+        self._bound()
 
     @property
     def frame_time(self) -> float:
@@ -77,7 +89,8 @@ class Relaxation:
     def warm_up(self) -> None:
         """Call every kernel once, on the state at rest, without other ranks."""
         twin = copy(self)
-        twin.state, twin.halo = deepcopy(self.state), None
+        twin.state, twin.halo, twin.sharpness = deepcopy(self.state), None, copy(self.sharpness)
+        twin.sharpness.wait, twin.sharpness.share = 1, 1.0
         twin.u_then, twin.f_then = self.u_then.copy(), self.f_then.copy()
         rehearse(twin.state, (*self.forces, *self.motion))
         twin.look()
@@ -88,12 +101,7 @@ class Relaxation:
         More sums: "rayleigh_force", "rayleigh_mass". More extremes: "change", "residual" (m).
         """
         s = self.state
-        self.required[:] = 0
-        found = self.survey.look(s, self.safety, self.required)
-        for diagonal in (0, 3, 5):
-            self.required[diagonal] += self.survey.required[0]
-        if self.halo is not None:
-            self.halo.sum(self.required)
+        found = self._bound()
         kernels.renew_tensors(s.mass, self.required, s.mobility, self.free, KEEP)
         kinetic, work, force, mass, change, residual = kernels.watch_relaxation(
             s.u, s.u_prev, s.f, s.mass, s.mobility, self.counted, self.u_then, self.f_then
@@ -110,6 +118,22 @@ class Relaxation:
             "change": change,
             "residual": residual,
         }
+
+    def _bound(self) -> dict[str, float]:
+        """Survey, and fill `required` with the masses that a stable step needs, on all ranks."""
+        s = self.state
+        self.required[:] = 0
+        found = self.survey.look(s, self.safety, self.required)
+        for diagonal in (0, 3, 5):
+            self.required[diagonal] += self.survey.required[0]
+        if self.halo is not None:
+            self.halo.sum(self.required)
+        if self.sharpness.due() and (s.share < 1 or self.sharpness.share == 0):
+            mobility = np.empty_like(self.required)
+            kernels.renew_tensors(np.zeros_like(self.required), self.required, mobility, self.free, 0.0)
+            self.sharpness.renew(s, mobility, (2 * self.safety) ** 2)
+        self.required *= self.sharpness.share
+        return found
 
     def decide(self, figures: dict[str, float]) -> tuple[bool, bool]:
         """Damping of the next steps; whether a frame is due now, and whether the static solution is reached."""

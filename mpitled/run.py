@@ -162,7 +162,7 @@ class _Run:
         if solver.method == "dynamic-relaxation":
             self.method = self._relaxation()
         else:
-            self.method = March(solver, frames, sub, self.force_halo, self._halo(1), model)
+            self.method = March(solver, frames, sub, world, self.force_halo, self._halo(1), model)
         self.progress = None if quiet or not world.leads else _Progress()
         self.interrupted = 0
         self.term_seconds: dict[str, float] = {}
@@ -178,13 +178,16 @@ class _Run:
         return Halo(self.world, self.sub.shared, components) if self.world.size > 1 else None
 
     def _relaxation(self) -> Relaxation:
-        return Relaxation(self.deck.solver, self.deck.output.frames, self.sub, self.force_halo, self._halo(6))
+        deck, halo = self.deck, self._halo(6)
+        return Relaxation(deck.solver, deck.output.frames, self.sub, self.world, self.force_halo, halo)
 
     # ------------------------------------------------------------ the loop
 
     def run(self) -> dict[str, Any]:
         with self.phases("compile"):
             self._warm_up()
+        with self.phases("begin"), everywhere():
+            self.method.begin()
         previous = {s: signal.signal(s, self._interrupt) for s in (signal.SIGINT, signal.SIGTERM)}
         writer = store.ResultWriter(
             self.directory,
@@ -252,6 +255,7 @@ class _Run:
         figures, seconds, end = self.figures, self.term_seconds, self.method.state
         self.method = relaxation = self._relaxation()
         relaxation.start_from(end, self.own_energy)
+        relaxation.begin()
         moved = math.nan
         try:
             self._advance(None)

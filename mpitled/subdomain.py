@@ -80,6 +80,13 @@ class Subdomain:
     def n_owned(self) -> int:
         return int(np.count_nonzero(self.rows.owned))
 
+    def free(self) -> NDArray[np.float64]:
+        """(3, n_nodes): 1 at free dofs, 0 at prescribed ones."""
+        free = np.ones((3, self.n_nodes))
+        for held in (self.fixed, self.moving):
+            free[held % 3, held // 3] = 0
+        return free
+
 
 def localise(rows: PartRows, hourglass: float, stabilisation: float, rule: str) -> Subdomain:
     """Local numbers and packed cells of a part.
