@@ -76,15 +76,21 @@ class Halo:
     Requests are persistent and the buffers are made once: nothing is allocated in an exchange.
     """
 
-    def __init__(self, world: World, shared: Sequence[tuple[int, NDArray[np.uint32]]], components: int) -> None:
+    def __init__(
+        self,
+        world: World,
+        shared: Sequence[tuple[int, NDArray[np.uint32]]],
+        components: int,
+        precision: type[np.floating] = np.float64,
+    ) -> None:
         """shared: (rank, nodes shared with it) in ascending order of rank; both sides list the same nodes."""
         self.components = components
         self.seconds = {"pack": 0.0, "wait": 0.0, "unpack": 0.0}
         self._all = np.unique(np.concatenate([nodes for _, nodes in shared])) if shared else np.zeros(0, np.uint32)
-        own = np.empty((components, len(self._all)))
+        own = np.empty((components, len(self._all)), precision)
         self._own = own
-        sends = [np.empty((components, len(nodes))) for _, nodes in shared]
-        receives = [np.empty((components, len(nodes))) for _, nodes in shared]
+        sends = [np.empty((components, len(nodes)), precision) for _, nodes in shared]
+        receives = [np.empty((components, len(nodes)), precision) for _, nodes in shared]
         self._packs = [(nodes, buffer) for (_, nodes), buffer in zip(shared, sends, strict=True)]
         turns = [(rank, nodes, buffer) for (rank, nodes), buffer in zip(shared, receives, strict=True)]
         turns.append((world.rank, self._all, own))
@@ -100,7 +106,7 @@ class Halo:
             self._requests += [comm.Send_init(b, rank) for (rank, _), b in zip(shared, sends, strict=True)]
             self._start, self._wait = MPI.Prequest.Startall, MPI.Request.Waitall
 
-    def sum(self, values: NDArray[np.float64]) -> None:
+    def sum(self, values: NDArray[np.floating]) -> None:
         """values (components, n_nodes) at shared nodes <- the sum over the ranks that share them."""
         clock = time.perf_counter
         begin = clock()

@@ -22,6 +22,8 @@ BETWEEN = 10
 KEEP = 0.9
 #: The estimate has to hold at so many surveys in a row.
 SETTLED = 3
+#: It has stalled when so many surveys in a row have not brought the least estimate down by this factor: round-off.
+STALLED, BETTER = 300, 0.99
 
 
 class Relaxation:
@@ -57,12 +59,13 @@ class Relaxation:
         self.counted: NDArray[np.float64] = self.free * sub.rows.owned  # free dofs that this rank owns
         self.u_then, self.f_then = np.zeros((3, sub.n_nodes)), np.zeros((3, sub.n_nodes))
         self.lowest, self.distance, self.frame, self.settled = 0.0, math.inf, 0, 0
+        self.best, self.waited = math.inf, 0
         self.forces, self.motion = compose_forces(sub, force_halo), compose_relaxation(sub, self.counted)
         self.sharpness = Sharpness(sub, world, self.forces, self.free)
 
     def start_from(self, s: State, energy: float) -> None:
         """Go on from the displacements of another run at the end of its load, at rest; `energy` (J) is in its cells."""
-        self.state.u[:] = self.state.u_prev[:] = s.u
+        self.state.place(s.u)
         self.state.time = self.state.load_time
         self.u_then[:] = s.u[:, : self.sub.n_nodes]
         self.state.external_work = energy
@@ -71,6 +74,11 @@ class Relaxation:
     def begin(self) -> None:
         """Find how sharp the bound of stiffness is. Collective."""
         self._bound()
+
+    @property
+    def stalled(self) -> bool:
+        """Whether it comes no nearer to the static solution, though that is farther than the tolerance."""
+        return self.waited >= STALLED
 
     @property
     def frame_time(self) -> float:
@@ -148,7 +156,10 @@ class Relaxation:
             self.settled = self.settled + 1 if steady and self.distance < self.tolerance else 0
         damping = 2 * math.sqrt(self.lowest)
         s.retain, s.gain = (2 - damping) / (2 + damping), 2 / (2 + damping)
-        if self.settled >= SETTLED:
+        if self.distance < BETTER * self.best:
+            self.best, self.waited = self.distance, 0
+        self.waited += loaded
+        if self.settled >= SETTLED or self.stalled:
             return True, True
         due = self.frame < self.frames and s.share >= self.frame / self.frames
         self.frame += due

@@ -36,6 +36,9 @@ BALANCE_LIMIT = 0.05
 #: squared of what little energy there is.
 LEDGER_STARTS = 50
 
+#: What `solver.precision` means for the cells' arithmetic.
+PRECISIONS: dict[str, type[np.floating]] = {"double": np.float64, "single": np.float32}
+
 MODEL = "model.h5"
 
 
@@ -101,7 +104,9 @@ def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False) -> di
     with phases("read"):
         rows = store.read_part(path, world.size, world.rank)
         rule = deck.hexahedra.gradient
-        sub = localise(rows, deck.hexahedra.hourglass, deck.support.stabilisation, rule)
+        sub = localise(
+            rows, deck.hexahedra.hourglass, deck.support.stabilisation, rule, PRECISIONS[deck.solver.precision]
+        )
         figures = store.read_figures(path)
     with everywhere():  # each rank finds the same
         run = _Run(deck, directory, world, sub, figures, phases, quiet)
@@ -156,7 +161,7 @@ class _Run:
         quiet: bool,
     ) -> None:
         self.deck, self.directory, self.world, self.sub, self.phases = deck, directory, world, sub, phases
-        self.force_halo = self._halo(3)
+        self.force_halo = self._halo(3, sub.precision)
         solver, frames = deck.solver, deck.output.frames
         self.method: March | Relaxation
         if solver.method == "dynamic-relaxation":
@@ -171,11 +176,11 @@ class _Run:
         self.own_energy = 0.0  # J, in this rank's cells
         self.distance = math.nan
         # The strain energy of the undeformed body is no better than this, J: tr C - 3 and ln J are not quite 0.
-        self.noise = 8 * np.finfo(float).eps * max(m.mu for m in sub.rows.materials) * model["volume_m3"]
+        self.noise = 8 * float(np.finfo(sub.precision).eps) * max(m.mu for m in sub.rows.materials) * model["volume_m3"]
         self.figures: dict[str, float] = {}
 
-    def _halo(self, components: int) -> Halo | None:
-        return Halo(self.world, self.sub.shared, components) if self.world.size > 1 else None
+    def _halo(self, components: int, precision: type[np.floating] = np.float64) -> Halo | None:
+        return Halo(self.world, self.sub.shared, components, precision) if self.world.size > 1 else None
 
     def _relaxation(self) -> Relaxation:
         deck, halo = self.deck, self._halo(6)
@@ -203,7 +208,9 @@ class _Run:
             self.phases.seconds["loop"] = time.perf_counter() - begin - self.phases.seconds.get("output", 0.0)
             made = self._run_figures(self.phases.seconds["loop"])
             if isinstance(self.method, Relaxation):
-                self.distance = self.method.distance
+                self.distance = self.method.best if self.method.stalled else self.method.distance
+                with everywhere():
+                    self._end_if_stalled(self.method)
             elif self.deck.solver.method == "quasi-static":
                 with self.phases("static distance"):
                     self.distance = self._distance_to_static()
@@ -250,6 +257,14 @@ class _Run:
             for _ in range(method.between):
                 take(step)
 
+    def _end_if_stalled(self, relaxation: Relaxation) -> None:
+        if relaxation.stalled:
+            raise UnstableError(
+                f"the relaxation comes no nearer to the static solution than {1e3 * relaxation.best:.2g} mm, by its "
+                f"own estimate; give solver.tolerance = {1.5e3 * relaxation.best:.2g} or more"
+                + (", or solver.precision = double" if self.deck.solver.precision == "single" else "")
+            )
+
     def _distance_to_static(self) -> float:
         """How far (m, the largest of all nodes) a ramp's end is from the static solution: found by going there."""
         figures, seconds, end = self.figures, self.term_seconds, self.method.state
@@ -261,7 +276,7 @@ class _Run:
             self._advance(None)
             n = self.sub.n_nodes
             own = np.abs(relaxation.state.u[:, :n] - end.u[:, :n]).max()
-            moved = float(self.world.gather([own]).max()) + relaxation.distance
+            moved = float(self.world.gather([own]).max()) + min(relaxation.distance, relaxation.best)
         except UnstableError:
             pass  # the run itself is well; only the estimate is not to be had
         self.figures, self.term_seconds = figures, seconds

@@ -42,7 +42,8 @@ class Sharpness:
         self.share = 0.0  # of the bound, that the operator has had at most
         self.wait = 0  # surveys until it is looked for again
         spread = float(np.ptp(sub.rows.points, axis=0).max()) if sub.n_nodes else 0.0
-        self._reach = 1e-8 * float(world.gather([spread]).max())  # m, of the largest displacement that is tried
+        # m, of the largest displacement that is tried: well above round-off, well below a cell.
+        self._reach = float(np.finfo(sub.precision).eps) ** 0.5 * 0.02 * float(world.gather([spread]).max())
 
     def due(self) -> bool:
         """Whether it is time to renew the share; called once a survey."""
@@ -62,9 +63,9 @@ class Sharpness:
         """
         n, iterations = self._sub.n_nodes, FIRST if self._mode is None else AGAIN
         trial = copy(s)
-        trial.u, trial.f = s.u.copy(), np.zeros_like(s.f)
+        trial.seen, trial.f = s.seen.copy(), np.zeros_like(s.f)
         self._take(trial)
-        at_rest = trial.f[:, :n].copy()
+        at_rest = trial.f[:, :n].astype(np.float64)
         mode = self._noise.copy() if self._mode is None else self._mode + NOISE * self._noise
         force, found = np.zeros_like(mode), 0.0
         for iteration in range(iterations):
@@ -73,7 +74,7 @@ class Sharpness:
                 return found
             mode /= size
             force /= size
-            trial.u[:, :n] = s.u[:, :n] + self._reach * mode
+            trial.seen[:, :n] = s.u[:, :n] + self._reach * mode
             trial.f[:] = 0
             self._take(trial)
             response = (trial.f[:, :n] - at_rest) * (self._free / self._reach)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +76,7 @@ class Subdomain:
     moving_full: NDArray[np.float64]  # (len(moving),), m at full load
     moving_turns: NDArray[np.float64] | None  # (len(moving), 3), see `loading.turn`; None where all move straight
     shared: tuple[tuple[int, NDArray[np.uint32]], ...]  # (rank, nodes shared with it), ranks ascending
+    precision: type[np.floating]  # of the cells' arithmetic
 
     @property
     def n_owned(self) -> int:
@@ -88,7 +90,9 @@ class Subdomain:
         return free
 
 
-def localise(rows: PartRows, hourglass: float, stabilisation: float, rule: str) -> Subdomain:
+def localise(
+    rows: PartRows, hourglass: float, stabilisation: float, rule: str, precision: type[np.floating] = np.float64
+) -> Subdomain:
     """Local numbers and packed cells of a part.
 
     hourglass is R_hg of eq. 4.22, stabilisation the share s of design (0: the paper's own support domains), rule the
@@ -115,9 +119,11 @@ def localise(rows: PartRows, hourglass: float, stabilisation: float, rule: str) 
         rows=rows,
         n_nodes=len(rows.nodes),
         n_cells=len(rows.cells),
-        runs=_voxel_runs(cells, edges, lame[:, :n_hexahedra], breaks, in_runs, hourglass),
-        hexahedra=_hexahedron_batches(rows.points, cells, general, lame, len(rows.cells), hourglass, rule),
-        domains=_domain_batches(rows, local(rows.domains), lame[:, n_hexahedra:], stabilisation),
+        runs=_in(precision, _voxel_runs(cells, edges, lame[:, :n_hexahedra], breaks, in_runs, hourglass)),
+        hexahedra=_in(
+            precision, _hexahedron_batches(rows.points, cells, general, lame, len(rows.cells), hourglass, rule)
+        ),
+        domains=_in(precision, _domain_batches(rows, local(rows.domains), lame[:, n_hexahedra:], stabilisation)),
         fixed=dofs[~moves],
         moving=dofs[moves],
         moving_full=rows.prescribed_displacements[moves],
@@ -128,7 +134,19 @@ def localise(rows: PartRows, hourglass: float, stabilisation: float, rule: str) 
                 rows.neighbours, rows.shared_offsets[:-1], rows.shared_offsets[1:], strict=True
             )
         ),
+        precision=precision,
     )
+
+
+def _in(precision: type[np.floating], cells: Any) -> Any:
+    """Packed cells, or None, with their numbers that are not indices in this precision."""
+    if cells is None:
+        return None
+    arrays = {f.name: getattr(cells, f.name) for f in fields(cells)}
+    real = {
+        name: a.astype(precision, copy=False) for name, a in arrays.items() if a is not None and a.dtype.kind == "f"
+    }
+    return replace(cells, **real)
 
 
 def _boxes(points: NDArray[np.float64], cells: NDArray[np.uint32]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:

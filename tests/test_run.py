@@ -182,6 +182,34 @@ def test_one_two_and_four_ranks_agree_and_repeat(tmp_path):
         assert other.tobytes() == values.tobytes()
 
 
+@pytest.mark.parametrize("method", ["quasi-static", "dynamic-relaxation"])
+def test_single_precision_of_the_cells_is_enough(tmp_path, method):
+    """On two ranks against double precision on one. u in single precision is known to 6e-8; across a cell of a tenth of
+    |u| that is a strain of 6e-7, by lambda / mu = 49 the shear strain of 3e-5 that balances its pressure, and over such
+    a cell 3e-6 of |u|. A few cells add up.
+    """
+    path = deck(tmp_path, GROWTH, volume=523.6)
+    fields = []
+    for n, precision in ((1, "double"), (2, "single")):
+        keys = (f"solver.method={method}", f"solver.precision={precision}", "solver.tolerance=1e-4")
+        mpitled("run", path, *(word for key in keys for word in ("--set", key)), "--out", tmp_path / precision, n=n)
+        fields.append(final(tmp_path / precision))
+    for single, double in zip(*reversed(fields), strict=True):
+        assert 0 < np.abs(single - double).max() < 3e-5 * np.abs(double).max()
+
+
+def test_a_tolerance_below_round_off_ends_with_what_can_be_reached(tmp_path):
+    path = deck(tmp_path, STRETCH, cloud="none", millimetres=6.0, load_time=0.1)
+    keys = ("solver.method=dynamic-relaxation", "solver.precision=single", "solver.tolerance=1e-9")
+    done = mpitled("run", path, *(w for key in keys for w in ("--set", key)), "--out", tmp_path / "out", status=3)
+    said = complaint(done)
+    assert "solver.tolerance" in said
+    reachable = float(said.split("solver.tolerance = ")[1].split()[0])
+    assert 1e-9 < reachable < 1e-2
+    keys = (*keys[:2], f"solver.tolerance={reachable}")
+    mpitled("run", path, *(w for key in keys for w in ("--set", key)), "--out", tmp_path / "out")
+
+
 def test_ranks_agree_to_round_off_in_the_linear_range(tmp_path):
     """A strain of 1/600: the round-off of I + grad u is 1e-13 of it, and some thousand steps add to that."""
     path = deck(tmp_path, STRETCH, cloud="core", millimetres=0.05, load_time=0.1)
