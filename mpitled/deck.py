@@ -245,6 +245,9 @@ class Solver:
     )
     safety: float = key("share of the longest stable step, by power iteration, that is taken", 0.8, limits="(0, 1]")
     mass_scaling: bool = key("quasi-static: raise the mass of nodes that the step is too long for", True)
+    on_inversion: Literal["stop", "recover"] = key(
+        "an unstable run stops, or goes back a little and on with a stricter step (at most 5 times)", "stop"
+    )
     precision: Literal["double", "single"] = key(
         "arithmetic of the cells' forces; nodes always move in double", "double"
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from copy import copy, deepcopy
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +51,8 @@ class Relaxation:
         self.sub, self.halo, self.safety, self.frames = sub, halo, solver.safety, frames
         self.tolerance = solver.tolerance
         self.between = BETWEEN
-        self.state = at_rest(sub, float(solver.load_steps), 1.0)
+        self.load_time = float(solver.load_steps)
+        self.state = at_rest(sub, self.load_time, 1.0)
         self.state.mass = np.zeros((6, sub.n_nodes))
         self.state.mobility = np.zeros((6, sub.n_nodes))
         self.survey = Survey(sub)
@@ -126,6 +128,24 @@ class Relaxation:
             "change": change,
             "residual": residual,
         }
+
+    def remember(self) -> dict[str, Any]:
+        """All that `recall` needs to come back to the present."""
+        names = ("state", "u_then", "f_then", "lowest", "distance", "frame", "settled", "best", "waited")
+        return {name: deepcopy(getattr(self, name)) for name in names}
+
+    def recall(self, saved: dict[str, Any]) -> None:
+        for name, value in deepcopy(saved).items():
+            setattr(self, name, value)
+
+    def harden(self) -> None:
+        """Go on from rest, with masses twice as large and the load half as fast, watched twice as often."""
+        self.state.place(self.state.u)
+        self.safety /= math.sqrt(2)
+        self.between = max(1, self.between // 2)
+        self.load_time *= 2
+        self.state.time *= self.load_time / self.state.load_time
+        self.state.load_time = self.load_time
 
     def _bound(self) -> dict[str, float]:
         """Survey, and fill `required` with the masses that a stable step needs, on all ranks."""

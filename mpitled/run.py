@@ -8,8 +8,10 @@ import resource
 import signal
 import sys
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -27,15 +29,12 @@ from mpitled.march import March
 from mpitled.relaxation import Relaxation
 from mpitled.step import Term
 from mpitled.subdomain import Subdomain, localise
+from mpitled.watch import Watch
 
 #: Cost in a step of a node of a support domain, in hexahedra, as `pytest -m study tests/test_kernels.py` measures it.
 DOMAIN_NODE_COST = 0.3
-#: The energy balance may be wrong by this share of the largest energy; beyond it the run is unstable.
-BALANCE_LIMIT = 0.05
-#: So many steps from rest the ledger is too coarse to judge by: its trapezoidal rule is wrong by about 8 over the steps
-#: squared of what little energy there is.
-LEDGER_STARTS = 50
-
+#: Looks from one state that recovery can go back to until the next, and how often a run may go back.
+SAVED, RECOVERIES = 5, 5
 #: What `solver.precision` means for the cells' arithmetic.
 PRECISIONS: dict[str, type[np.floating]] = {"double": np.float64, "single": np.float32}
 
@@ -143,10 +142,6 @@ def _on_leader(world: World, work: Any) -> Any:
     return outcome
 
 
-#: What is not summed over the ranks.
-_EXTREMES = {"min_jacobian": min, "step_ratio": max, "change": max, "residual": max}
-
-
 class _Run:
     """The time loop of one rank and what is watched, written and counted around it."""
 
@@ -169,15 +164,15 @@ class _Run:
         else:
             self.method = March(solver, frames, sub, world, self.force_halo, self._halo(1), model)
         self.progress = None if quiet or not world.leads else _Progress()
-        self.interrupted = 0
+        self.interrupted = False
         self.term_seconds: dict[str, float] = {}
-        self.largest_kinetic_ratio = 0.0
-        self.largest_energy = 0.0
-        self.own_energy = 0.0  # J, in this rank's cells
         self.distance = math.nan
-        # The strain energy of the undeformed body is no better than this, J: tr C - 3 and ln J are not quite 0.
-        self.noise = 8 * float(np.finfo(sub.precision).eps) * max(m.mu for m in sub.rows.materials) * model["volume_m3"]
-        self.figures: dict[str, float] = {}
+        self.volume = model["volume_m3"]
+        self.watch = Watch(world, sub, self.volume)
+        self.recoveries = 0
+        self.written = -math.inf  # time of the last frame
+        # The displacements that were good at the last look, their frame's time, and what was seen of them.
+        self.good, self.good_time, self.good_figures = np.zeros((3, sub.n_nodes)), 0.0, self.watch.figures
 
     def _halo(self, components: int, precision: type[np.floating] = np.float64) -> Halo | None:
         return Halo(self.world, self.sub.shared, components, precision) if self.world.size > 1 else None
@@ -233,29 +228,64 @@ class _Run:
     def _advance(self, writer: store.ResultWriter | None) -> None:
         """Steps, a survey and decisions, and so on to the end of the method."""
         method, clock = self.method, time.perf_counter
-        state, forces, motion = method.state, method.forces, method.motion
+        forces, motion = method.forces, method.motion
         reactions, update = motion[:-1], motion[-1:]
         seconds = self.term_seconds = dict.fromkeys((name for name, _ in (*forces, *motion)), 0.0)
 
         def take(terms: tuple[Term, ...]) -> None:
+            state = method.state
             for name, term in terms:
                 begin = clock()
                 term(state)
                 seconds[name] += clock() - begin
 
         step, last = (*update, *forces, *reactions), False
+        saved: deque[Any] = deque(maxlen=2)  # to go back to the older of them; the younger may be ill already
         take((*forces, *reactions))
-        while True:
-            with everywhere():
-                self._watch()
-            due, last = method.decide(self.figures)
+        for look in count():
+            try:
+                with everywhere():
+                    self._look()
+            except UnstableError:
+                if not saved or self.recoveries == RECOVERIES:
+                    self._write_last_good(writer)
+                    raise
+                self.recoveries += 1
+                method.recall(saved[0])
+                method.harden()
+                continue
+            due, last = method.decide(self.watch.figures)
             if due and writer is not None:
                 with self.phases("output"):
-                    self._write(writer)
+                    self._write(writer, method.frame_time)
             if last:
                 return
+            if self.deck.solver.on_inversion == "recover" and (due or look % SAVED == 0):
+                if due:
+                    saved.clear()  # what is written stays
+                saved.append(method.remember())
             for _ in range(method.between):
                 take(step)
+
+    def _look(self) -> None:
+        method = self.method
+        self.watch.look(method, self.interrupted)
+        if self.progress:
+            self.progress.show(method.progress, method.state.step, self.watch.figures)
+        if self.watch.interrupted:
+            share = method.state.share
+            raise InterruptedRun(f"interrupted at {share:.1%} of the load; what was written is readable")
+        self.good[:] = method.state.u[:, : self.sub.n_nodes]
+        self.good_time, self.good_figures = method.frame_time, self.watch.figures
+
+    def _write_last_good(self, writer: store.ResultWriter | None) -> None:
+        """As one more frame of a run that cannot go on, unless it is there already."""
+        if writer is None or self.good_time <= self.written:
+            return
+        self.method.state.place(self.good)
+        self.method.survey.look(self.method.state, self.method.safety)
+        self.watch.figures = self.good_figures
+        self._write(writer, self.good_time)
 
     def _end_if_stalled(self, relaxation: Relaxation) -> None:
         if relaxation.stalled:
@@ -267,19 +297,20 @@ class _Run:
 
     def _distance_to_static(self) -> float:
         """How far (m, the largest of all nodes) a ramp's end is from the static solution: found by going there."""
-        figures, seconds, end = self.figures, self.term_seconds, self.method.state
+        ramp, watch, seconds = self.method, self.watch, self.term_seconds
         self.method = relaxation = self._relaxation()
-        relaxation.start_from(end, self.own_energy)
+        self.watch = Watch(self.world, self.sub, self.volume)
+        relaxation.start_from(ramp.state, watch.own_energy)
         relaxation.begin()
         moved = math.nan
         try:
             self._advance(None)
             n = self.sub.n_nodes
-            own = np.abs(relaxation.state.u[:, :n] - end.u[:, :n]).max()
+            own = np.abs(relaxation.state.u[:, :n] - ramp.state.u[:, :n]).max()
             moved = float(self.world.gather([own]).max()) + min(relaxation.distance, relaxation.best)
         except UnstableError:
             pass  # the run itself is well; only the estimate is not to be had
-        self.figures, self.term_seconds = figures, seconds
+        self.method, self.watch, self.term_seconds = ramp, watch, seconds
         return moved
 
     def _warm_up(self) -> None:
@@ -292,67 +323,8 @@ class _Run:
 
     # ------------------------------------------------------------ what is watched
 
-    def _watch(self) -> None:
-        """Survey all ranks, keep the ledger, and end the run on all of them alike if it cannot go on."""
-        state, world = self.method.state, self.world
-        own = self.method.look()
-        self.own_energy = own["strain"] + own["hourglass"] + own["stabilisation"]
-        table = world.gather([*own.values(), float(self.interrupted)])
-        columns = dict(zip(own, table.T, strict=False))
-        figures = {name: float(_EXTREMES.get(name, sum)(columns[name])) for name in own}
-        internal = figures["strain"] + figures["hourglass"] + figures["stabilisation"]
-        supplied = figures["external"] + figures["added"] - figures["dissipated"]
-        self.largest_energy = max(self.largest_energy, abs(figures["external"]), internal, figures["kinetic"])
-        figures["balance_error"] = abs(supplied - internal - figures["kinetic"]) / (self.largest_energy or 1.0)
-        figures["kinetic_ratio"] = figures["kinetic"] / internal if internal > 0 else 0.0
-        if state.share >= 0.1:
-            self.largest_kinetic_ratio = max(self.largest_kinetic_ratio, figures["kinetic_ratio"])
-        self.figures = figures
-        if self.progress:
-            self.progress.show(self.method.progress, state.step, figures)
-        finite = math.isfinite(internal + figures["kinetic"] + figures["external"])
-        balance = figures["balance_error"] * self.largest_energy
-        if not finite or figures["min_jacobian"] <= 0:
-            reason = "a cell is turned inside out"
-        elif balance > BALANCE_LIMIT * self.largest_energy + self.noise and state.step >= LEDGER_STARTS:
-            reason = (
-                f"the energy balance is wrong by {figures['balance_error']:.1%} (supplied {supplied:.3g} J, internal "
-                f"{internal:.3g} J, kinetic {figures['kinetic']:.3g} J)"
-            )
-        else:
-            reason = ""
-        if reason:
-            worst = int(np.argmin(np.where(np.isnan(columns["min_jacobian"]), -np.inf, columns["min_jacobian"])))
-            cell = world.broadcast(self._worst_cell() if world.rank == worst else None, worst)
-            raise UnstableError(
-                f"unstable at {state.share:.1%} of the load: {reason}; {cell}; the step is "
-                f"{figures['step_ratio']:.2f} of the longest proved stable; load more slowly (solver.load_time, "
-                "solver.load_steps), refine the mesh or the cloud there, or enlarge cloud.radius"
-            )
-        if table[:, -1].any():
-            raise InterruptedRun(f"interrupted at {state.share:.1%} of the load; what was written is readable")
-
-    def _worst_cell(self) -> str:
-        """What and where the cell with the smallest J on this rank is, in a few words."""
-        rows, jacobian = self.sub.rows, self.method.survey.jacobian[:-1]
-        cell = int(np.argmin(np.where(np.isnan(jacobian), -np.inf, jacobian)))
-        n_hexahedra = len(rows.hexahedra)
-        hexahedron = cell < n_hexahedra
-        nodes = rows.hexahedra[cell] if hexahedron else rows.domains[cell - n_hexahedra]
-        local = np.searchsorted(rows.nodes, nodes)
-        x, y, z = 1e3 * (rows.points[local].mean(axis=0) if hexahedron else rows.domain_points[cell - n_hexahedra])
-        edges = rows.points[local] - rows.points[local].mean(axis=0)
-        stretched = edges + self.method.state.u[:, local].T - self.method.state.u[:, local].T.mean(axis=0)
-        stretch = np.linalg.norm(stretched, axis=1).max() / np.linalg.norm(edges, axis=1).max()
-        return (
-            f"worst is {'hexahedron' if hexahedron else 'support domain'} {rows.cells[cell]} "
-            f"({rows.materials[rows.material[cell]].name}) at ({x:.1f}, {y:.1f}, {z:.1f}) mm on rank {self.world.rank} "
-            f"with J = {jacobian[cell]:.3g} now, {self.method.state.smallest_jacobian:.3g} at its worst, and a stretch "
-            f"of {stretch:.3g}"
-        )
-
     def _interrupt(self, signum: int, frame: object) -> None:
-        self.interrupted = 1
+        self.interrupted = True
 
     # ------------------------------------------------------------ what is written
 
@@ -372,15 +344,16 @@ class _Run:
             },
         }
 
-    def _write(self, writer: store.ResultWriter) -> None:
+    def _write(self, writer: store.ResultWriter, frame_time: float) -> None:
         rows, u = self.sub.rows, self.method.state.u[:, : self.sub.n_nodes]
         domains = np.searchsorted(rows.nodes, rows.domains)
         at_points = np.einsum("ga,cga->gc", rows.domain_shapes, u[:, domains])
         displacement = np.concatenate([u.T[rows.owned], at_points])
         field = np.concatenate([self._field(u, domains)[rows.owned], at_points])
-        series = {name: self.figures[name] for name in _SERIES}
+        series = {name: self.watch.figures[name] for name in _SERIES}
+        self.written = frame_time
         writer.write_frame(
-            self.method.frame_time,
+            frame_time,
             {"displacement": displacement, "field_displacement": field},
             {"J": self.method.survey.jacobian[:-1]},
             series,
@@ -417,11 +390,12 @@ class _Run:
         )
         hexahedra, domains, halo_share, computed, peak = table.T
         cells = hexahedra.sum() + domains.sum()
-        figures = self.figures or dict.fromkeys(_SERIES, float("nan"))
+        figures = self.watch.figures or dict.fromkeys(_SERIES, float("nan"))
         return {
             "ranks": world.size,
             "steps": state.step,
             "time_step_s": state.time_step,
+            "recoveries": self.recoveries,
             "seconds": dict(self.phases.seconds) | {"loop": loop_seconds},
             "term_seconds": self.term_seconds,
             "cells": {"hexahedra": int(hexahedra.sum()), "support_domains": int(domains.sum())},
@@ -444,7 +418,7 @@ class _Run:
                 "balance_error": figures["balance_error"],
             },
             "kinetic_to_internal": {
-                "largest_after_10_percent": self.largest_kinetic_ratio,
+                "largest_after_10_percent": self.watch.largest_kinetic_ratio,
                 "at_end": figures["kinetic_ratio"],
             },
         }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -306,7 +307,28 @@ def test_an_unstable_run_stops_and_says_why(tmp_path, n):
         assert word in line
     with open_result(tmp_path / "out") as result:
         assert not result.complete
-        assert result.n_frames >= 1
+        assert result.n_frames >= 2  # at rest, and the last good state
+        assert np.abs(result.at_nodes("displacement", -1)).max() > 1e-3
+        assert result.in_cells("J", -1).min() > 0
+
+
+@pytest.mark.parametrize(("method", "keys"), [
+    ("dynamic-relaxation", ("solver.load_steps=40",)),  # so fast that the seed runs into its neighbours
+    ("quasi-static", ("solver.safety=1.0", "solver.load_time=0.1")),  # at the very edge of stability
+])  # fmt: skip
+def test_an_unstable_run_recovers_on_request(tmp_path, method, keys):
+    """It ends where a slow, safe run ends, within what both say is left to the static solution."""
+    path = deck(tmp_path, GROWTH, volume=523.6)
+    words = [word for key in (f"solver.method={method}", *keys) for word in ("--set", key)]
+    mpitled("run", path, "--out", tmp_path / "stops", *words, status=3)
+    mpitled("run", path, "--out", tmp_path / "recovers", *words, "--set", "solver.on_inversion=recover")
+    report = json.loads((tmp_path / "recovers" / "report.json").read_text())
+    assert 1 <= report["recoveries"] <= 5
+    assert report["energy_J"]["balance_error"] < 0.05
+    mpitled("run", path, "--out", tmp_path / "safe", "--set", "solver.method=dynamic-relaxation")
+    within = 1e-3 * report["static_distance_mm"] + 1e-5
+    for found, safe in zip(final(tmp_path / "recovers"), final(tmp_path / "safe"), strict=True):
+        assert np.abs(found - safe).max() < within
 
 
 @pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
