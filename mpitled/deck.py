@@ -264,8 +264,12 @@ class Solver:
     hold_time: float = key("quasi-static, dynamic: duration after it, at full load", 0.0, "s", "[0, inf)")
     load_steps: int = key("dynamic-relaxation: steps in which the load grows", 500, limits="[1, inf)")
     tolerance: float = key("dynamic-relaxation ends this near to the static solution", 0.01, "mm", "(0, inf)")
-    time_step: Literal["auto"] | float = key("time step, at most; auto: the longest stable one times safety", "auto", "s", "(0, inf)")
-    safety: float = key("share of the longest stable step, found by power iteration, that is taken", 0.8, limits="(0, 1]")
+    time_step: Literal["auto"] | float = key(
+        "time step, at most; auto: the longest stable one times safety", "auto", "s", "(0, inf)"
+    )
+    safety: float = key(
+        "share of the longest stable step, found by power iteration, that is taken", 0.8, limits="(0, 1]"
+    )
     mass_scaling: bool = key("quasi-static: raise the mass of nodes that the step is too long for", True)
 
 
