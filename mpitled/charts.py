@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 #: Colours and marks of families of runs, told apart by the colour-blind (Okabe and Ito 2008).
 _COLOURS = ("#000000", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -46,3 +50,45 @@ def draw_study(rows: list[dict[str, Any]], path: Path, error: str) -> None:
     axes.grid(True, which="both", linewidth=0.3)
     axes.legend(fontsize=8)
     figure.savefig(path, dpi=150)
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """A line on a body's surface in the plane y = 0, deformed as a reference and as runs have it; all (n, 3), mm."""
+
+    title: str
+    places: NDArray[np.float64]  # undeformed, in order; a gap where they are far apart
+    reference: NDArray[np.float64]  # displacements
+    runs: dict[str, NDArray[np.float64]]  # label -> displacements
+
+
+def draw_profiles(profiles: Sequence[Profile], path: Path) -> Figure:
+    """Draw and save each profile as it is deformed, and below it how far each run is from the reference along it."""
+    figure = Figure(figsize=(4.6 * len(profiles), 8), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(2, len(profiles), squeeze=False, height_ratios=[2, 1])
+    for (above, below), profile in zip(panels.T, profiles, strict=True):
+        steps = np.linalg.norm(np.diff(profile.places, axis=0), axis=1)
+        gaps = np.flatnonzero(steps > 4 * np.median(steps)) + 1
+        along = np.insert(np.cumsum(np.insert(steps, 0, 0.0)), gaps, np.nan)
+
+        def line(displacement: NDArray[np.float64] | float, profile: Profile = profile, gaps: Any = gaps) -> Any:
+            return np.insert(profile.places + displacement, gaps, np.nan, axis=0)[:, [0, 2]].T
+
+        above.plot(*line(0.0), color=_INK, linewidth=0.8, linestyle=":", label="undeformed")
+        above.plot(
+            *line(profile.reference), color=_INK, linestyle="", marker="o", markersize=5, markerfacecolor="none",
+            label="reference",
+        )  # fmt: skip
+        for i, (label, displacement) in enumerate(profile.runs.items(), 1):
+            style: dict[str, Any] = {"color": _COLOURS[i], "linestyle": ("-", "--", "-.")[i % 3], "linewidth": 1.2}
+            above.plot(*line(displacement), label=label, **style)
+            apart = np.linalg.norm(displacement - profile.reference, axis=1)
+            below.plot(along, np.insert(apart, gaps, np.nan), label=label, **style)
+        above.set(title=profile.title, xlabel="x, mm", ylabel="z, mm", aspect="equal")
+        below.set(xlabel="along the undeformed line, mm", ylabel="distance from the reference, mm", ylim=(0, None))
+        below.grid(True, linewidth=0.3)
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+    figure.savefig(path, dpi=120)
+    return figure

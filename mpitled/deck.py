@@ -19,7 +19,7 @@ from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_ty
 
 from mpitled.errors import InputError
 from mpitled.material import Material
-from mpitled.mesh import Constraint, Rotation
+from mpitled.mesh import METRES, Constraint, Rotation
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -84,6 +84,7 @@ class Block:
     elements: tuple[int, int, int] = key("hexahedra along x, y, z", limits="[1, inf)")
     cloud: Literal["none", "core", "all"] = key("what the cloud replaces: nothing, an inner block, everything", "none")
     core_share: float = key('share of each edge that `cloud = "core"` replaces', 0.5, limits="(0, 1)")
+    fitted: str | None = key("name of a [sphere.NAME] that hexahedra follow; `elements` are then along the edges", None)
 
 
 _Length = Literal["m", "cm", "mm"]
@@ -99,6 +100,11 @@ class Cylinder:
     element_size: float = key("edge of a hexahedron, in the mean", 5.0, "mm", "(0, inf)")
     cloud: Literal["none", "core", "all"] = key("what the cloud replaces: nothing, the inner part, everything", "none")
     core_share: float = key('share of radius and height that `cloud = "core"` replaces', 0.5, limits="(0, 1)")
+    grading: float = key(
+        'thickness of the layers at both ends and of the outermost ring as a share of the mean; 1 with `cloud = "all"`',
+        0.3,
+        limits="(0, 1]",
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,6 +115,11 @@ class Ellipsoid:
     element_size: float = key("edge of a hexahedron, in the mean", 5.0, "mm", "(0, inf)")
     cloud: Literal["none", "core", "all"] = key("what the cloud replaces: nothing, the inner part, everything", "none")
     core_share: float = key('share of the semi-axes that `cloud = "core"` replaces', 0.5, limits="(0, 1)")
+    grading: float = key(
+        'size of elements beside the edges of patch and fixed as a share of the mean; 1 with `cloud = "all"`',
+        1.0,
+        limits="(0, 1]",
+    )
     cavity: Literal["fitted", "moved"] = key(
         "seed without a cloud: shells around it, or one hexahedron whose nodes move (the paper)", "fitted"
     )
@@ -206,6 +217,15 @@ class MaterialSection:
         return Material(self.name, self.youngs_modulus, self.poissons_ratio, self.density)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sphere:
+    """Cells whose middle lies in a sphere make the cell set NAME, for a material's `cells`; NAME is free."""
+
+    name: str
+    centre: tuple[float, float, float] = key("its centre", unit="mm")
+    radius: float = key("its radius", unit="mm", limits="(0, inf)")
+
+
 _XYZ = Literal["x", "y", "z"]
 
 
@@ -222,7 +242,11 @@ class Displaced:
     """Nodes that are moved along the loading curve; any number of these."""
 
     nodes: str = key("name of a node set")
-    displacement: tuple[float, ...] = key("displacement at full load, one for each direction", unit="mm")
+    displacement: tuple[float, ...] | None = key("displacement at full load, one for each direction", None, "mm")
+    field: Path | None = key(
+        "instead: CSV of x, y, z, ux, uy, uz, places and their displacements, carried over to the nodes", None
+    )
+    field_unit: _Length | None = key("unit of length of `field`; mm unless given", None)
     directions: tuple[_XYZ, ...] = key("directions that are prescribed; the others stay free", ("x", "y", "z"))
     rotation: float = key("angle at full load, by which the nodes are turned as well", 0.0, "degrees", "[-360, 360]")
     axis: _XYZ = key("direction of the rotation's axis", "z")
@@ -281,6 +305,7 @@ class Deck:
     cloud: Cloud = field(default_factory=Cloud)
     support: Support = field(default_factory=Support)
     hexahedra: Hexahedra = field(default_factory=Hexahedra)
+    spheres: tuple[Sphere, ...] = field(default=(), metadata={"section": "sphere"})
     materials: tuple[MaterialSection, ...] = field(default=(), metadata={"section": "material"})
     fixed: tuple[Fixed, ...] = ()
     displaced: tuple[Displaced, ...] = ()
@@ -296,7 +321,11 @@ class Deck:
         for i, moved in enumerate(self.displaced):
             turn = Rotation(moved.rotation, "xyz".index(moved.axis), moved.centre)
             origin = f"{self.path}: displaced.{i}.nodes"
-            yield Constraint(moved.nodes, _axes(moved), moved.displacement, origin, turn if turn.angle else None)
+            axes, rotation = _axes(moved), turn if turn.angle else None
+            displacement = moved.displacement or (0.0,) * len(axes)
+            yield Constraint(
+                moved.nodes, axes, displacement, origin, rotation, moved.field, METRES[moved.field_unit or "mm"]
+            )
 
 
 def _axes(section: Fixed | Displaced) -> tuple[int, ...]:
@@ -628,8 +657,17 @@ def _check(deck: Deck, source: _Source) -> None:
                 named[label] = name
     if deck.tumour:
         _check_tumour(deck, given, source)
+    spheres = [sphere.name for sphere in deck.spheres]
+    if deck.block and deck.block.fitted is not None and deck.block.fitted not in spheres:
+        what = f"is none of the spheres ({', '.join(spheres) or 'there are none'}); add [sphere.{deck.block.fitted}]"
+        raise source.error("block.fitted", what, deck.block.fitted)
     for i, moved in enumerate(deck.displaced):
-        if len(moved.displacement) != len(moved.directions):
+        if moved.displacement is None and moved.field is None:
+            what = "is missing; give a list of numbers, in mm, or displaced.field, a CSV of places and displacements"
+            raise source.error(f"displaced.{i}.displacement", what)
+        if moved.displacement and moved.field:
+            raise source.error(f"displaced.{i}.field", "is there beside displacement; give one of the two")
+        if moved.displacement and len(moved.displacement) != len(moved.directions):
             what = f"has not one number for each of {_show(moved.directions)}; give {len(moved.directions)}, in mm"
             raise source.error(f"displaced.{i}.displacement", what, given["displaced"][i]["displacement"])
         if moved.rotation and set("xyz") - {moved.axis} - set(moved.directions):
@@ -680,7 +718,7 @@ def canonical(deck: Deck) -> dict[str, Any]:
     return plain(deck)
 
 
-_MODEL = (*GEOMETRIES, "tumour", "cloud", "support", "hexahedra", "materials", "fixed", "displaced")
+_MODEL = (*GEOMETRIES, "tumour", "cloud", "support", "hexahedra", "spheres", "materials", "fixed", "displaced")
 
 
 def model_key(deck: Deck, included: Sequence[Path] = ()) -> str:
