@@ -1,4 +1,4 @@
-"""The command line: `mpitled run|build|check|export|partition|report|compare|info`."""
+"""The command line: `mpitled run|build|check|export|partition|report|compare|study|bench|predict|info`."""
 
 from __future__ import annotations
 
@@ -109,6 +109,13 @@ def _parser() -> argparse.ArgumentParser:
     study.add_argument("--beyond", type=float, metavar="MM", help="errors farther than this from prescribed edges")
     study.set_defaults(command=_study)
 
+    bench = commands.add_parser("bench", help="speed of the step on fixed scenes, against what the machine can do")
+    bench.add_argument("--json", type=Path, metavar="FILE", help="write the outcome")
+    bench.add_argument("--compare", type=Path, metavar="OLD.json", help="exit status 1 if a case is 10 %% slower")
+    bench.add_argument("--ranks", metavar="N,...", help="numbers of ranks (1,2 where there are two cores)")
+    bench.add_argument("--quick", action="store_true", help="the smallest of each scene, in less time")
+    bench.set_defaults(command=_bench)
+
     info = commands.add_parser("info", help="versions of what mpitled works with, and what is missing; or of a file")
     info.add_argument("file", type=Path, nargs="?", help="model.h5 or result.vtkhdf: say what it is and holds")
     info.set_defaults(command=_info)
@@ -202,6 +209,30 @@ def _study(options: argparse.Namespace) -> None:
     out = options.out or Path("out") / f"study_{options.deck.stem}"
     print(study.table(study.study(options.deck, options.reference, options.vary, options.set, out, beyond)))
     print(f"written to {out}")
+
+
+def _bench(options: argparse.Namespace) -> int:
+    from mpitled import bench
+
+    ranks = _numbers("--ranks", options.ranks) if options.ranks else bench.default_ranks()
+    old = bench.load(options.compare) if options.compare else None
+    outcome = bench.bench(ranks, options.quick, old)
+    print(bench.table(outcome))
+    if options.json:
+        bench.write(outcome, options.json)
+    if old is None:
+        return 0
+    text, slower = bench.comparison(outcome, old)
+    print(text)
+    return int(slower)
+
+
+def _numbers(name: str, text: str) -> list[int]:
+    """Whole numbers above 0 between commas."""
+    words = text.split(",")
+    if not all(word.strip().isdecimal() and int(word) > 0 for word in words):
+        raise InputError(f"{name} {text}: is not a list of whole numbers above 0; write for example {name} 1,2")
+    return [int(word) for word in words]
 
 
 def _info(options: argparse.Namespace) -> int:
