@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import json
 
-import numpy as np
 import pytest
-from conftest import complaint, mpitled
-
-from mpitled import bench, limits
+from conftest import mpitled
 
 CASE = {"scene", "cells", "precision", "ranks", "million_cell_updates_per_second_per_core", "bytes_per_cell",
         "halo_share", "roofline_share"}  # fmt: skip
