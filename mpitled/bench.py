@@ -69,7 +69,8 @@ nodes = "surface"
 """
 #: The repository's own brain, where this is a clone of it.
 _BRAIN = Path(__file__).parents[1] / "jobs" / "brain_tumour.toml"
-_SIZES: dict[str, tuple[Any, ...]] = {
+#: What each kind of scene is built from.
+SIZES: dict[str, tuple[Any, ...]] = {
     "voxel": (20, 40, 80),  # elements along each edge
     "distorted": (20, 40, 80),
     "cloud": (16, 28, 48),
@@ -98,10 +99,10 @@ def bench(ranks: Sequence[int], quick: bool, old: dict[str, Any] | None = None) 
     with tempfile.TemporaryDirectory(prefix="mpitled-bench-") as name:
         folder = Path(name)
         scenes = []
-        for scene, sizes in _SIZES.items():
+        for kind, sizes in SIZES.items():
             for size in sizes[:1] if quick else sizes:
-                _say(f"building {scene} {size}")
-                scenes.append(_scene(folder / f"{scene}-{size}", scene, size))
+                _say(f"building {kind} {size}")
+                scenes.append(scene(folder / f"{kind}-{size}", kind, size))
                 for n in ranks:
                     if n > 1:
                         runs.divide(Path(scenes[-1]["model"]), n, 0)
@@ -116,7 +117,7 @@ def bench(ranks: Sequence[int], quick: bool, old: dict[str, Any] | None = None) 
         for n in ranks:
             slower = {case["scene"] for case, ratio in compared(result, old) if ratio < SLOWER and case["ranks"] == n}
             if slower:
-                job["scenes"] = [scene for scene in scenes if scene["scene"] in slower]
+                job["scenes"] = [each for each in scenes if each["scene"] in slower]
                 _keep_better(result["cases"], _timed(folder, job, n)["cases"])
         return result
 
@@ -233,13 +234,13 @@ def _commit() -> str:
         return ""
 
 
-def _scene(folder: Path, scene: str, size: Any, nodes: int = DOMAIN_NODES) -> dict[str, Any]:
+def scene(folder: Path, kind: str, size: Any, nodes: int = DOMAIN_NODES) -> dict[str, Any]:
     """Build one scene in a folder of its own, and say what a process needs to know of it."""
     folder.mkdir()
-    deck = _deck(folder, scene, size, nodes)
+    deck = _deck(folder, kind, size, nodes)
     model = folder / runs.MODEL
     mesh = preprocess.read_mesh(deck)
-    if scene == "distorted":
+    if kind == "distorted":
         assert deck.block is not None
         inner = np.setdiff1d(np.arange(mesh.n_nodes), mesh.node_sets["surface"])
         points = mesh.points.copy()
@@ -248,7 +249,7 @@ def _scene(folder: Path, scene: str, size: Any, nodes: int = DOMAIN_NODES) -> di
         mesh = replace(mesh, points=points)
     store.write_model(model, preprocess.discretise(deck, mesh), "bench")
     return {
-        "scene": scene,
+        "scene": kind,
         "size": size,
         "model": str(model),
         "hourglass": deck.hexahedra.hourglass,
@@ -270,9 +271,9 @@ def _deck(folder: Path, scene: str, size: Any, nodes: int) -> Deck:
 
 def _operations(folder: Path) -> dict[str, dict[str, float]]:
     """Floating-point operations of each term, per cell or node, by scene."""
-    scenes = [_scene(folder / f"count-{scene}", scene, size) for scene, size in _COUNTED.items()]
-    default = _scene(folder / "count-mixed", "cloud", _COUNTED["cloud"], Support().nodes)
-    models = [Path(scene["model"]) for scene in (*scenes, default)]
+    scenes = [scene(folder / f"count-{kind}", kind, size) for kind, size in _COUNTED.items()]
+    default = scene(folder / "count-mixed", "cloud", _COUNTED["cloud"], Support().nodes)
+    models = [Path(each["model"]) for each in (*scenes, default)]
     counted = flops.of_terms(models, scenes[0]["stabilisation"])
     voxel, distorted, cloud, mixed = counted
     return {"voxel": voxel, "distorted": distorted, "cloud": cloud, "mixed": {**voxel, **distorted, **mixed}}

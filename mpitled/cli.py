@@ -115,6 +115,7 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument("--compare", type=Path, metavar="OLD.json", help="exit status 1 if a case is 10 %% slower")
     bench.add_argument("--ranks", metavar="N,...", help="numbers of ranks (1,2 where there are two cores)")
     bench.add_argument("--quick", action="store_true", help="the smallest of each scene, in less time")
+    bench.add_argument("--omissions", action="store_true", help="instead: what each thing costs that a scene can lack")
     bench.set_defaults(command=_bench)
 
     predict = commands.add_parser("predict", help="efficiency on a cluster, from real partitions in many parts")
@@ -234,6 +235,11 @@ def _study(options: argparse.Namespace) -> None:
 def _bench(options: argparse.Namespace) -> int:
     from mpitled import bench
 
+    if options.omissions:
+        from mpitled import omissions
+
+        print(omissions.measure(options.quick))
+        return 0
     ranks = _numbers("--ranks", options.ranks) if options.ranks else bench.default_ranks()
     old = bench.load(options.compare) if options.compare else None
     outcome = bench.bench(ranks, options.quick, old)

@@ -16,7 +16,7 @@ import numpy as np
 from mpitled import limits, store
 from mpitled.flops import with_values
 from mpitled.halo import Halo, World
-from mpitled.step import State, Term, at_rest, compose_forces, compose_march
+from mpitled.step import State, Term, at_rest, compose_forces, compose_march, compose_relaxation
 from mpitled.subdomain import Subdomain, localise
 from mpitled.witness import Call, distinct_bytes, witness
 
@@ -60,9 +60,13 @@ class Pace:
         }
 
 
-def made(sub: Subdomain, world: World, precision: str) -> Pace:
-    """The step of a part in a precision, in a state that is strained by about 1 %."""
+def made(sub: Subdomain, world: World, precision: str, relaxed: bool = False) -> Pace:
+    """The step of a part in a precision, marching or in relaxation, in a state that is strained by about 1 %."""
     state = at_rest(sub, 1.0, _TIME_STEP)
+    if relaxed:
+        mobility = state.mobility
+        state.mobility = np.zeros((6, sub.n_nodes))
+        state.mobility[[0, 3, 5]] = mobility
     x = sub.rows.points.T
     x = (x - x.mean(axis=1, keepdims=True)) / np.ptp(x)
     strained = _STRAIN * np.ptp(sub.rows.points) * (x[[1, 2, 0]] + np.sin(2 * np.pi * _WAVES * x) / (6 * _WAVES))
@@ -70,7 +74,9 @@ def made(sub: Subdomain, world: World, precision: str) -> Pace:
     state.time = _SHARE * state.load_time
     sub, state = (with_values(part, lambda values: values.astype(precision)) for part in (sub, state))
     halo = Halo(world, sub.shared, 3) if world.size > 1 else None
-    return Pace(sub, state, (*compose_forces(sub, halo), *compose_march(sub)), halo)
+    counted = np.ones((3, sub.n_nodes), precision)
+    motion = compose_relaxation(sub, counted) if relaxed else compose_march(sub)
+    return Pace(sub, state, (*compose_forces(sub, halo), *motion), halo)
 
 
 def timed(acts: Mapping[str, Callable[[int], None]], world: World, repeats: int, span: float) -> dict[str, float]:
@@ -107,7 +113,11 @@ def main() -> None:
     cases = []
     for scene in job["scenes"]:
         if world.leads:
-            print(f"{world.size} ranks: {scene['scene']} {scene['size']}", file=sys.stderr, flush=True)
+            print(
+                f"{world.size} rank{'s' if world.size > 1 else ''}: {scene['scene']} {scene['size']}",
+                file=sys.stderr,
+                flush=True,
+            )
         operations = job["operations"][scene["scene"]]
         cases += _cases(scene, operations, multiply_adds, world, repeats, span)
     if world.leads:
