@@ -92,3 +92,30 @@ def draw_profiles(profiles: Sequence[Profile], path: Path) -> Figure:
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
     figure.savefig(path, dpi=120)
     return figure
+
+
+def draw_prediction(rows: list[dict[str, Any]], subject: str, assumptions: str, path: Path) -> None:
+    """Efficiency against the number of parts, as predicted, and what of it the balance alone would leave."""
+    figure = Figure(figsize=(8, 5.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    parts = [row["parts"] for row in rows]
+    lines = {
+        "balance of the partition alone": [100 / row["balance"] for row in rows],
+        "exchange overlapped with computing": [100 * row["efficiency_overlapped"] for row in rows],
+        "exchange after computing": [100 * row["efficiency"] for row in rows],
+    }
+    for i, (label, values) in enumerate(lines.items()):
+        axes.plot(parts, values, label=label, color=_COLOURS[i], marker=_MARKERS[i], linewidth=1.2)
+    for row in rows:
+        text = f"{row['cells_mean']:.3g} cells\n{row['step_us']:.3g} us a step"
+        place = (row["parts"], 100 * row["efficiency"])
+        axes.annotate(text, place, xytext=(0, -12), textcoords="offset points", fontsize=7, ha="center", va="top")
+    axes.set(xscale="log", ylim=(0, 105), xlabel="ranks", ylabel="predicted efficiency, %")
+    axes.set_xticks(parts, [str(n) for n in parts])
+    axes.minorticks_off()
+    axes.margins(x=0.08)
+    axes.grid(True, linewidth=0.3)
+    axes.legend(fontsize=8, loc="lower left")
+    axes.set_title(f"{subject}: {assumptions}", fontsize=8, loc="left")
+    figure.savefig(path, dpi=150)

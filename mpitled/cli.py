@@ -1,4 +1,4 @@
-"""The command line: `mpitled run|build|check|export|partition|report|compare|info`."""
+"""The command line: `mpitled run|build|check|export|partition|report|compare|study|bench|predict|info`."""
 
 from __future__ import annotations
 
@@ -56,6 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     run = commands.add_parser("run", help="compute a deck; on N ranks: mpirun -n N mpitled run DECK")
     _deck_arguments(run)
     run.add_argument("-q", "--quiet", action="store_true", help="no progress and no table")
+    run.add_argument("--dry", action="store_true", help="say what would be done, and how long it would take; no step")
     run.set_defaults(command=_run)
 
     build = commands.add_parser("build", help="build the model of a deck")
@@ -109,6 +110,26 @@ def _parser() -> argparse.ArgumentParser:
     study.add_argument("--beyond", type=float, metavar="MM", help="errors farther than this from prescribed edges")
     study.set_defaults(command=_study)
 
+    bench = commands.add_parser("bench", help="speed of the step on fixed scenes, against what the machine can do")
+    bench.add_argument("--json", type=Path, metavar="FILE", help="write the outcome")
+    bench.add_argument("--compare", type=Path, metavar="OLD.json", help="exit status 1 if a case is 10 %% slower")
+    bench.add_argument("--ranks", metavar="N,...", help="numbers of ranks (1,2 where there are two cores)")
+    bench.add_argument("--quick", action="store_true", help="the smallest of each scene, in less time")
+    bench.add_argument("--omissions", action="store_true", help="instead: what each thing costs that a scene can lack")
+    bench.set_defaults(command=_bench)
+
+    predict = commands.add_parser("predict", help="efficiency on a cluster, from real partitions in many parts")
+    predict.add_argument("model", type=Path, help="model.h5, or the folder that holds it")
+    predict.add_argument(
+        "--parts", default="64,256,1024,4096,16384", metavar="N,...", help="numbers of ranks (%(default)s)"
+    )
+    predict.add_argument("--latency", type=float, metavar="US", help="microseconds a message takes (1.5)")
+    predict.add_argument("--bandwidth", type=float, metavar="GB/S", help="of one rank, in each direction (10)")
+    predict.add_argument("--rate", type=float, metavar="M", help="million hexahedra a second of one core (25)")
+    predict.add_argument("--fixed", type=float, metavar="US", help="microseconds of a step that depend on no size (15)")
+    predict.add_argument("--out", type=Path, metavar="DIR", help="folder of predict.csv and predict.png (the model's)")
+    predict.set_defaults(command=_predict)
+
     info = commands.add_parser("info", help="versions of what mpitled works with, and what is missing; or of a file")
     info.add_argument("file", type=Path, nargs="?", help="model.h5 or result.vtkhdf: say what it is and holds")
     info.set_defaults(command=_info)
@@ -135,6 +156,13 @@ def _run(options: argparse.Namespace) -> None:
     world = World()
     with everywhere():  # each rank reads the same file
         deck = load_deck(options.deck, options.set)
+    if options.dry:
+        from mpitled.dry import dry_run
+
+        told = dry_run(deck, _output(options), world)
+        if world.leads:
+            print(told)
+        return
     made = run(deck, _output(options), world, quiet=options.quiet)
     if world.leads and not options.quiet:
         from mpitled import report
@@ -202,6 +230,53 @@ def _study(options: argparse.Namespace) -> None:
     out = options.out or Path("out") / f"study_{options.deck.stem}"
     print(study.table(study.study(options.deck, options.reference, options.vary, options.set, out, beyond)))
     print(f"written to {out}")
+
+
+def _bench(options: argparse.Namespace) -> int:
+    from mpitled import bench
+
+    if options.omissions:
+        from mpitled import omissions
+
+        print(omissions.measure(options.quick))
+        return 0
+    ranks = _numbers("--ranks", options.ranks) if options.ranks else bench.default_ranks()
+    old = bench.load(options.compare) if options.compare else None
+    outcome = bench.bench(ranks, options.quick, old)
+    print(bench.table(outcome))
+    if options.json:
+        bench.write(outcome, options.json)
+    if old is None:
+        return 0
+    text, slower = bench.comparison(outcome, old)
+    print(text)
+    return int(slower)
+
+
+def _predict(options: argparse.Namespace) -> None:
+    from dataclasses import replace
+
+    from mpitled import predict
+
+    counts, path = _numbers("--parts", options.parts), _model(options.model)
+    cluster = predict.Cluster()
+    for name, unit in (("latency", 1e-6), ("bandwidth", 1e9), ("rate", 1e6), ("fixed", 1e-6)):
+        value = getattr(options, name)
+        if value is not None:
+            if not 0 < value < float("inf"):
+                raise InputError(f"--{name} {value:g}: is not a number above 0; give one")
+            cluster = replace(cluster, **{name: value * unit})
+    out = options.out or path.parent
+    print(predict.table(predict.predict(path, counts, cluster, out), cluster))
+    print(f"written to {out}")
+
+
+def _numbers(name: str, text: str) -> list[int]:
+    """Whole numbers above 0 between commas."""
+    words = text.split(",")
+    if not all(word.strip().isdecimal() and int(word) > 0 for word in words):
+        raise InputError(f"{name} {text}: is not a list of whole numbers above 0; write for example {name} 1,2")
+    return [int(word) for word in words]
 
 
 def _info(options: argparse.Namespace) -> int:

@@ -14,14 +14,17 @@ from pathlib import Path
 DONE = "done.json"
 
 
+def ranked(ranks: int) -> list[str]:
+    """The words that start so many ranks; none for one."""
+    return ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(ranks)] if ranks > 1 else []
+
+
 def command(deck: Path, overrides: Sequence[str], ranks: int, folder: Path) -> list[str]:
     """What computes a deck with overrides ("section.key=value") into a folder, quietly."""
     start = [sys.executable, "-c", "from mpitled.cli import main; main()"]
     words = [*start, "run", str(deck), "-q", "--out", str(folder)]
     words += [word for override in overrides for word in ("--set", override)]
-    if ranks > 1:
-        words = ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(ranks), *words]
-    return words
+    return [*ranked(ranks), *words]
 
 
 def run_apart(deck: Path, overrides: Sequence[str], ranks: int, folder: Path) -> str:

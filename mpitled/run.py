@@ -40,6 +40,9 @@ PRECISIONS: dict[str, type[np.floating]] = {"double": np.float64, "single": np.f
 
 MODEL = "model.h5"
 
+#: What ends a run in order. mpirun kills its ranks itself when it gets one of the first two; the third it passes on.
+INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+
 
 class Phases:
     """Wall time of each phase of a run, s."""
@@ -74,16 +77,16 @@ def build(deck: Deck, directory: Path) -> tuple[Path, bool]:
 
 def divide(path: Path, n_parts: int, seed: int) -> str:
     """Partition a model in n_parts, stored in its file under that number; a table of the parts."""
-    model = store.read_model(path)
-    costs = (1.0, DOMAIN_NODE_COST * model.domains.shape[1])
-    graph = partition.cell_graph(model.hexahedra, model.domains, model.domain_points)
+    hexahedra, domains, places = store.read_cells(path)
+    costs = (1.0, DOMAIN_NODE_COST * domains.shape[1])
+    graph = partition.cell_graph(hexahedra, domains, places)
     try:
         part = partition.cut(graph, n_parts, costs, seed)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from None
-    tables = partition.tables(model.hexahedra, model.domains, part, n_parts)
+    tables = partition.tables(hexahedra, domains, part, n_parts)
     store.write_partition(path, tables)
-    return partition.figures(tables, costs, len(model.hexahedra), graph).describe()
+    return partition.figures(tables, costs, len(hexahedra), graph).describe()
 
 
 def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False) -> dict[str, Any]:
@@ -91,6 +94,11 @@ def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False) -> di
 
     The report, on every rank. InputError, UnstableError or InterruptedRun alike on all ranks.
     """
+    return prepare(deck, directory, world, quiet=quiet).run()
+
+
+def prepare(deck: Deck, directory: Path, world: World, *, quiet: bool = False) -> _Run:
+    """All that is done before the first step of `run`: model, partition, this rank's part, and the composed step."""
     phases = Phases()
     with phases("model"):
         path = _on_leader(world, lambda: build(deck, directory)[0])
@@ -108,8 +116,7 @@ def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False) -> di
         )
         figures = store.read_figures(path)
     with everywhere():  # each rank finds the same
-        run = _Run(deck, directory, world, sub, figures, phases, quiet)
-    return run.run()
+        return _Run(deck, directory, world, sub, figures, phases, quiet)
 
 
 @contextmanager
@@ -185,10 +192,10 @@ class _Run:
 
     def run(self) -> dict[str, Any]:
         with self.phases("compile"):
-            self._warm_up()
+            self.warm_up()
         with self.phases("begin"), everywhere():
             self.method.begin()
-        previous = {s: signal.signal(s, self._interrupt) for s in (signal.SIGINT, signal.SIGTERM)}
+        previous = {s: signal.signal(s, self._interrupt) for s in INTERRUPTS}
         writer = store.ResultWriter(
             self.directory,
             self.world.comm,
@@ -313,7 +320,7 @@ class _Run:
         self.method, self.watch, self.term_seconds = ramp, watch, seconds
         return moved
 
-    def _warm_up(self) -> None:
+    def warm_up(self) -> None:
         """Compile, or load from the disk's cache: rank 0 first, so that the others find its work there."""
         if not self.world.leads:
             self.world.barrier()

@@ -106,6 +106,12 @@ def read_model(path: Path) -> Model:
         )
 
 
+def read_cells(path: Path) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Hexahedra (n, 8), support domains (m, k) and their points (m, 3), m: all that a partition is made from."""
+    with _open_model(path) as file:
+        return file["hexahedra"][...], file["domains"][...], file["domain_points"][...]
+
+
 def model_key(path: Path) -> str | None:
     """The key that the model was written with; None if there is no model of this layout."""
     try:

@@ -1,0 +1,87 @@
+"""The scheduler scripts as plain shell, where there is no scheduler: they build, cut, run, and end before the limit."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import ENVIRONMENT, ROOT, ranks
+
+from mpitled.store import open_result
+
+SCRIPTS = ("slurm.sh", "pbs.sh")
+SCENE = """
+[block]
+size = [20.0, 20.0, 20.0]
+elements = [6, 6, 6]
+[material.brain]
+youngs_modulus = 3000.0
+poissons_ratio = 0.3
+[[fixed]]
+nodes = "x0"
+[[displaced]]
+nodes = "x1"
+displacement = [0.1, 0.0, 0.0]
+[solver]
+method = "dynamic"
+load_time = 0.02
+[output]
+frames = 1
+"""
+
+
+def cluster(folder: Path, script: str, **more: str) -> tuple[list[str], dict[str, str]]:
+    """The words that start a script in a folder that stands for a set-up clone, and the scheduler's variables."""
+    ranks(2)  # skips where there is no mpirun
+    (folder / "jobs").mkdir()
+    (folder / "jobs" / "environment.sh").touch()
+    (folder / "scene.toml").write_text(SCENE)
+    (folder / "nodes").write_text("localhost\nlocalhost\n")
+    given = {
+        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+        "OMPI_MCA_rmaps_base_oversubscribe": "1",
+        "OMPI_MCA_hwloc_base_binding_policy": "none",
+        "SLURM_SUBMIT_DIR": str(folder),
+        "PBS_O_WORKDIR": str(folder),
+        "PBS_NODEFILE": str(folder / "nodes"),
+        "SLURM_NTASKS": "2",
+        "DECK": "scene.toml",
+    }
+    words = ["bash", str(ROOT / "jobs" / script), *(["scene.toml"] if script == "slurm.sh" else [])]
+    return words, {**ENVIRONMENT, **given, **more}
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_job_builds_cuts_and_runs(tmp_path, script):
+    words, variables = cluster(tmp_path, script)
+    done = subprocess.run(words, env=variables, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "2 parts: balance" in done.stdout
+    with open_result(tmp_path / "out" / "scene") as result:
+        assert result.complete
+        assert result.metadata["ranks"] == 2
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_job_ends_in_order_before_its_time_is_up(tmp_path, script):
+    """SLURM sends a signal; PBS sends none in time, so that the script has a clock."""
+    words, variables = cluster(tmp_path, script, RUN_SECONDS="15", SET="solver.load_time=5000.0")
+    if script == "slurm.sh":
+        words += ["--set", "solver.load_time=5000.0"]
+    file = tmp_path / "out" / "scene" / "result.partial.vtkhdf"
+    with subprocess.Popen(words, env=variables, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.time() + 60
+        while script == "slurm.sh" and not file.exists() and time.time() < deadline:
+            time.sleep(0.1)
+        if script == "slurm.sh":
+            process.send_signal(signal.SIGUSR1)
+        _, errors = process.communicate(timeout=90)
+    assert process.returncode == 4, errors
+    assert "interrupted" in errors
+    with open_result(tmp_path / "out" / "scene") as result:
+        assert not result.complete

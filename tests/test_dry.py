@@ -1,0 +1,65 @@
+"""The dry run against the run: the same terms on as many steps, and a reason for whatever is left out."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+from conftest import mpitled
+
+from mpitled.deck import load_deck
+from mpitled.dry import reasons
+from mpitled.halo import World
+from mpitled.run import prepare
+from mpitled.witness import kernel_names
+
+SCENE = """
+[block]
+size = [20.0, 20.0, 20.0]
+elements = [8, 7, 7]
+cloud = "{cloud}"
+[material.brain]
+youngs_modulus = 3000.0
+poissons_ratio = 0.3
+[[fixed]]
+nodes = "x0"
+[[displaced]]
+nodes = "x1"
+displacement = [0.1, 0.0, 0.0]
+[solver]
+load_time = 0.1
+[output]
+frames = 1
+"""
+
+
+@pytest.mark.parametrize(("cloud", "ranks", "overrides"), [
+    ("none", 1, ["hexahedra.hourglass=0.01"]),
+    ("core", 2, ["solver.method=dynamic", "support.stabilisation=0", "solver.load_time=0.01"]),
+    ("all", 1, ["solver.method=dynamic-relaxation", "displaced.0.rotation=10"]),
+])  # fmt: skip
+def test_a_dry_run_tells_the_terms_that_the_run_takes_and_takes_no_step(tmp_path, cloud, ranks, overrides):
+    deck, out = tmp_path / "scene.toml", tmp_path / "out"
+    deck.write_text(SCENE.format(cloud=cloud))
+    arguments = ["run", deck, "--out", out, *(word for override in overrides for word in ("--set", override))]
+    told = mpitled(*arguments, "--dry", n=ranks).stdout
+    assert [path.name for path in out.iterdir()] == ["model.h5"]
+    mpitled(*arguments, "-q", n=ranks)
+    report = json.loads((out / "report.json").read_text())
+    assert re.findall(r"^  ([a-z ]+), [0-9.]+ ms$", told, re.M) == list(report["term_seconds"])
+    rows = [line.split() for line in told.splitlines()[1 : 1 + ranks]]
+    assert sum(int(row[1]) for row in rows) == report["cells"]["hexahedra"]
+    assert sum(int(row[2]) for row in rows) == report["cells"]["support_domains"]
+    steps = int(re.search(r"^steps: (\d+)", told, re.M)[1])
+    assert steps == (500 if cloud == "all" else report["steps"])
+    assert ("of domain_forces and domain_survey: support.stabilisation = 0" in told) == (cloud == "core")
+    assert ("pack, clear, unpack: one rank" in told) == (ranks == 1)
+    assert ("follow: no node is turned" in told) == (cloud != "all")
+
+
+def test_every_kernel_is_either_taken_or_left_out_for_a_reason(tmp_path):
+    deck = tmp_path / "scene.toml"
+    deck.write_text(SCENE.format(cloud="none"))
+    scene = load_deck(deck)
+    assert set(reasons(scene, prepare(scene, tmp_path, World()).sub, World())) == set(kernel_names())
