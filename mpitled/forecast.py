@@ -1,0 +1,56 @@
+"""What a run will take on one rank of this machine: its steps, and the time of one, measured on the model itself."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from mpitled import store
+from mpitled.deck import Deck
+from mpitled.march import March
+from mpitled.model import Model
+from mpitled.relaxation import Relaxation
+from mpitled.subdomain import localise
+
+_MEASURED = 0.3  # s of steps, and three of them at least
+
+
+class Forecast(NamedTuple):
+    """Steps and times of the loop; building, pictures and a ramp's distance to rest come on top."""
+
+    steps: int
+    at_least: bool  # whether the method goes on until it is at rest, which nobody knows beforehand
+    step_s: float
+    loop_s: float
+
+    def describe(self) -> str:
+        """In a line."""
+        least = "at least " if self.at_least else ""
+        return f"{least}{self.steps} steps of {1e3 * self.step_s:.2g} ms: {least}{self.loop_s:.2g} s on one rank here"
+
+
+def forecast(deck: Deck, model: Model) -> Forecast:
+    """Takes a few steps at rest. InputError if the deck's step is too long for the model."""
+    with tempfile.TemporaryDirectory() as folder:  # ranks read their part from a file, and so does this one
+        path = Path(folder) / "model.h5"
+        store.write_model(path, model, "")
+        rows = store.read_part(path, 1, 0)
+    sub = localise(rows, deck.hexahedra.hourglass, deck.support.stabilisation, deck.hexahedra.gradient)
+    method: March | Relaxation
+    if deck.solver.method == "dynamic-relaxation":
+        method = Relaxation(deck.solver, deck.output.frames, sub, None, None)
+        steps = deck.solver.load_steps
+    else:
+        method = March(deck.solver, deck.output.frames, sub, None, None, model.figures)
+        steps = math.ceil(method.end / method.state.time_step * (1 - 1e-9))
+    method.warm_up()
+    taken, begin = 0, time.perf_counter()
+    while taken < 3 or time.perf_counter() - begin < _MEASURED:
+        for _, term in (*method.motion[-1:], *method.forces, *method.motion[:-1]):
+            term(method.state)
+        taken += 1
+    each = (time.perf_counter() - begin) / taken
+    return Forecast(steps, isinstance(method, Relaxation), each, steps * each)
