@@ -25,13 +25,13 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
     def command(name: str, words: str, *, json: bool = False) -> argparse.ArgumentParser:
         added = of_all.add_parser(name, help=words)
         added.set_defaults(command=commands[name], verbose=False, json=False)
-        added.add_argument("-v", "--verbose", action="store_true", help="say what is at work, on which rank, and when")
         if json:
             added.add_argument("--json", action="store_true", help="JSON instead of a table")
         return added
 
     run = command("run", "compute a deck; on N ranks: mpirun -n N mpitled run DECK", json=True)
     _deck(run)
+    run.add_argument("-v", "--verbose", action="store_true", help="also each phase as it begins, with its rank")
     run.add_argument("-q", "--quiet", action="store_true", help="no progress and no table")
 
     sweep = command("sweep", "a table over values of keys, a run for each; goes on where it was stopped", json=True)

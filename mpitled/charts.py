@@ -108,14 +108,13 @@ def draw_quantities(
         for j, (family, rows) in enumerate(families.items()):
             points = sorted((row[key], row[name]) for row in rows if row.get(name, "") != "")
             axes.plot(
-                [x for x, _ in points], [y for _, y in points], label=family, linewidth=1, markersize=4,
+                [x for x, _ in points], [y for _, y in points], label=family or "here", linewidth=1, markersize=4,
                 color=_COLOURS[j % len(_COLOURS)], marker=_MARKERS[j % len(_MARKERS)],
             )  # fmt: skip
         axes.set(xlabel=label, ylabel=heading)
         axes.grid(True, linewidth=0.3)
     if len(families) > 1:
         handles, names = figure.axes[0].get_legend_handles_labels()
-        names = [name or "here" for name in names]
         figure.legend(handles, names, loc="outside lower center", ncols=min(4, len(families)), fontsize=8)
     figure.savefig(path, dpi=150)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import logging
 import math
 import resource
 import signal
@@ -40,6 +41,8 @@ PRECISIONS: dict[str, type[np.floating]] = {"double": np.float64, "single": np.f
 
 MODEL = "model.h5"
 
+_log = logging.getLogger(__name__)
+
 
 class Phases:
     """Wall time of each phase of a run, s."""
@@ -50,6 +53,8 @@ class Phases:
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
         begin = time.perf_counter()
+        if name not in self.seconds:
+            _log.info("%s", name)
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
 
@@ -203,6 +208,7 @@ class _Run:
             series=_SERIES,
         )
         begin = time.perf_counter()
+        _log.info("loop")
         try:
             self._advance(writer)
             self.phases.seconds["loop"] = time.perf_counter() - begin - self.phases.seconds.get("output", 0.0)

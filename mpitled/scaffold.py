@@ -117,8 +117,8 @@ def _key(written: str, key: deck.Declared, value: Any) -> Iterator[str]:
     yield f"# {key.meaning}; {key.expected}"
     if value is not None:
         yield f"{written} = {_toml(value)}"
-    else:
-        yield f"# {written} = {'' if key.default is None else _toml(key.default)}".rstrip()
+    else:  # an empty list stands for what is not given
+        yield f"# {written} = {'' if key.default in (None, ()) else _toml(key.default)}".rstrip()
 
 
 def _toml(value: Any) -> str:
