@@ -10,9 +10,11 @@ from typing import NamedTuple
 
 from mpitled import store
 from mpitled.deck import Deck
+from mpitled.halo import World
 from mpitled.march import March
 from mpitled.model import Model
 from mpitled.relaxation import Relaxation
+from mpitled.run import PRECISIONS
 from mpitled.subdomain import localise
 
 _MEASURED = 0.3  # s of steps, and three of them at least
@@ -38,15 +40,19 @@ def forecast(deck: Deck, model: Model) -> Forecast:
         path = Path(folder) / "model.h5"
         store.write_model(path, model, "")
         rows = store.read_part(path, 1, 0)
-    sub = localise(rows, deck.hexahedra.hourglass, deck.support.stabilisation, deck.hexahedra.gradient)
+    solver, frames, world = deck.solver, deck.output.frames, World()
+    hourglass, rule, precision = deck.hexahedra.hourglass, deck.hexahedra.gradient, PRECISIONS[solver.precision]
+    sub = localise(rows, hourglass, deck.support.stabilisation, rule, precision)
     method: March | Relaxation
-    if deck.solver.method == "dynamic-relaxation":
-        method = Relaxation(deck.solver, deck.output.frames, sub, None, None)
-        steps = deck.solver.load_steps
+    if solver.method == "dynamic-relaxation":
+        method = Relaxation(solver, frames, sub, world, None, None)
     else:
-        method = March(deck.solver, deck.output.frames, sub, None, None, model.figures)
-        steps = math.ceil(method.end / method.state.time_step * (1 - 1e-9))
+        method = March(solver, frames, sub, world, None, None, model.figures)
     method.warm_up()
+    method.begin()
+    steps = solver.load_steps
+    if isinstance(method, March):
+        steps = math.ceil(method.end / method.state.time_step * (1 - 1e-9))
     taken, begin = 0, time.perf_counter()
     while taken < 3 or time.perf_counter() - begin < _MEASURED:
         for _, term in (*method.motion[-1:], *method.forces, *method.motion[:-1]):
