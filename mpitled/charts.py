@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -118,4 +119,44 @@ def draw_prediction(rows: list[dict[str, Any]], subject: str, assumptions: str, 
     axes.grid(True, linewidth=0.3)
     axes.legend(fontsize=8, loc="lower left")
     axes.set_title(f"{subject}: {assumptions}", fontsize=8, loc="left")
+
+
+def draw_quantities(
+    families: Mapping[str, Sequence[Mapping[str, Any]]], key: str, label: str, quantities: Mapping[str, str], path: Path
+) -> None:
+    """Each quantity (name: heading) of rows against their number under `key`, a line for each family of rows."""
+    across = min(4, math.ceil(len(quantities) ** 0.5) + 1)
+    down = math.ceil(len(quantities) / across)
+    figure = Figure(figsize=(3.4 * across, 2.7 * down + 0.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    for i, (name, heading) in enumerate(quantities.items(), 1):
+        axes = figure.add_subplot(down, across, i)
+        for j, (family, rows) in enumerate(families.items()):
+            points = sorted((row[key], row[name]) for row in rows if row.get(name, "") != "")
+            axes.plot(
+                [x for x, _ in points], [y for _, y in points], label=family or "here", linewidth=1, markersize=4,
+                color=_COLOURS[j % len(_COLOURS)], marker=_MARKERS[j % len(_MARKERS)],
+            )  # fmt: skip
+        axes.set(xlabel=label, ylabel=heading)
+        axes.grid(True, linewidth=0.3)
+    if len(families) > 1:
+        handles, names = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=min(4, len(families)), fontsize=8)
+    figure.savefig(path, dpi=150)
+
+
+def draw_cost(points: Sequence[tuple[float, float, str]], path: Path) -> None:
+    """Error estimate (mm) against the time of the loop (s) of runs, each with its name beside it."""
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for seconds, error, name in points:
+        axes.plot(seconds, error, color=_COLOURS[1], marker="o", linestyle="none")
+        axes.annotate(name, (seconds, error), xytext=(6, 4), textcoords="offset points", fontsize=8)
+    axes.set(xscale="log", yscale="log", xlabel="time of the loop, s", ylabel="error estimate, mm")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(_plain)
+        axis.set_minor_formatter(_plain)
+    axes.margins(0.2)
+    axes.grid(True, which="both", linewidth=0.3)
     figure.savefig(path, dpi=150)

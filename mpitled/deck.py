@@ -11,7 +11,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import MISSING, Field, asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from types import UnionType
@@ -726,15 +726,24 @@ def model_key(deck: Deck, included: Sequence[Path] = ()) -> str:
 
     `included` are files that those of the deck read in turn.
     """
+    return _content(deck, _MODEL, included, program=program())
+
+
+def scene_key(deck: Deck, included: Sequence[Path] = ()) -> str:
+    """What determines the result, whatever the program: all sections, like `model_key`."""
+    return _content(deck, (f.name for f in fields(deck) if f.name not in ("title", "path")), included)
+
+
+def _content(deck: Deck, names: Iterable[str], included: Sequence[Path], **more: str) -> str:
     sections = asdict(deck)
-    content: dict[str, Any] = {"program": _program()} | {name: sections[name] for name in _MODEL}
+    content: dict[str, Any] = more | {name: sections[name] for name in names}
     if included:
         content["included"] = list(included)
     return json.dumps(content, sort_keys=True, separators=(",", ":"), default=_digest)
 
 
 @functools.cache
-def _program() -> str:
+def program() -> str:
     """This program by its sources: a model that others built may differ from what they would build."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
@@ -748,6 +757,40 @@ def _digest(path: Path) -> str:
         while part := file.read(1 << 20):
             digest.update(part)
     return f"sha256:{digest.hexdigest()}"
+
+
+def keys() -> list[str]:
+    """Every "section.key" of sections that are there once, whatever they are called."""
+    return [f"{home[1:-1]}.{about[0]}" for home, _, about in _declared() if about and re.fullmatch(r"\[\w+\]", home)]
+
+
+class Declared(NamedTuple):
+    """What people are told of a key."""
+
+    meaning: str
+    expected: str  # "a number above 0, in mm"
+    default: Any  # in the deck's unit; None where there is none
+
+
+def declared(home: str) -> tuple[str, dict[str, Declared]]:
+    """What a section is, written as "[labels]", "[material.NAME]" or "[[fixed]]", and its keys."""
+    about, found = "", {}
+    for of, section, entry in _declared():
+        if of == home and entry:
+            written, hint, key = entry
+            default = None if key.default is MISSING else key.default
+            found[written] = Declared(key.meaning, _expected(hint, key), default)
+        elif of == home:
+            about = (section.__doc__ or "").strip()
+    return about, found
+
+
+def unit_of(name: str) -> str:
+    """Unit of the key "section.key" in a deck; "" if it has none, or there is no such key."""
+    section, _, written = name.rpartition(".")
+    home = section.partition(".")[0]
+    declared = {(of.strip("[]").partition(".")[0], about[0]): about[2].unit for of, _, about in _declared() if about}
+    return declared.get((home, written), "")
 
 
 def markdown_table() -> str:

@@ -28,16 +28,21 @@ def library_version() -> str:
 
 
 class World:
-    """All ranks of the job. Every method is collective: reached by every rank or by none."""
+    """All ranks of the job, or a group of them. Every method is collective: reached by every rank or by none."""
 
-    def __init__(self) -> None:
-        self.comm: Any = None
-        self.rank, self.size = 0, 1
-        if any(int(os.environ.get(name, "1")) > 1 for name in _SIZES):
+    def __init__(self, comm: Any = None) -> None:
+        """comm: of a group, see `split`; without it all ranks that were started."""
+        if comm is None and any(int(os.environ.get(name, "1")) > 1 for name in _SIZES):
             from mpi4py import MPI
 
-            self.comm = MPI.COMM_WORLD
-            self.rank, self.size = self.comm.rank, self.comm.size
+            comm = MPI.COMM_WORLD
+        self.rank: int = 0 if comm is None else comm.rank
+        self.size: int = 1 if comm is None else comm.size
+        self.comm: Any = comm if self.size > 1 else None
+
+    def split(self, size: int) -> World:
+        """This rank's group, where so many ranks in turn make one."""
+        return World(self.comm.Split(self.rank // size, self.rank))
 
     @property
     def leads(self) -> bool:

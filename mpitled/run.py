@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import importlib.metadata
+import logging
 import math
 import resource
 import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
@@ -44,6 +45,9 @@ MODEL = "model.h5"
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
 
 
+_log = logging.getLogger(__name__)
+
+
 class Phases:
     """Wall time of each phase of a run, s."""
 
@@ -53,6 +57,8 @@ class Phases:
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
         begin = time.perf_counter()
+        if name not in self.seconds:
+            _log.info("%s", name)
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
 
@@ -60,12 +66,7 @@ class Phases:
 def build(deck: Deck, directory: Path) -> tuple[Path, bool]:
     """The model of a deck in directory/model.h5, and whether it had to be built: the same deck uses it again."""
     path = directory / MODEL
-    included: list[Path] = []
-    if deck.mesh:
-        from mpitled import meshes
-
-        included = meshes.files(deck.mesh)
-    key = decks.model_key(deck, included)
+    key = decks.model_key(deck, included(deck))
     if store.model_key(path) == key:
         return path, False
     directory.mkdir(parents=True, exist_ok=True)
@@ -73,6 +74,15 @@ def build(deck: Deck, directory: Path) -> tuple[Path, bool]:
 
     store.write_model(path, preprocess.build(deck), key, decks.canonical(deck))
     return path, True
+
+
+def included(deck: Deck) -> list[Path]:
+    """Files that those of the deck read in turn."""
+    if not deck.mesh:
+        return []
+    from mpitled import meshes
+
+    return meshes.files(deck.mesh)
 
 
 def divide(path: Path, n_parts: int, seed: int) -> str:
@@ -101,13 +111,13 @@ def prepare(deck: Deck, directory: Path, world: World, *, quiet: bool = False) -
     """All that is done before the first step of `run`: model, partition, this rank's part, and the composed step."""
     phases = Phases()
     with phases("model"):
-        path = _on_leader(world, lambda: build(deck, directory)[0])
+        path = on_leader(world, lambda: build(deck, directory)[0])
     if world.leads and not quiet:
         for remark in store.read_remarks(path):
             print(f"note: {remark}", file=sys.stderr, flush=True)
     with phases("partition"):
         if world.size > 1:
-            _on_leader(world, lambda: _ensure_partition(path, world.size, deck.partition.seed))
+            on_leader(world, lambda: ensure_partition(path, world.size, deck.partition.seed))
     with phases("read"):
         rows = store.read_part(path, world.size, world.rank)
         rule = deck.hexahedra.gradient
@@ -129,12 +139,13 @@ def everywhere() -> Iterator[None]:
         raise
 
 
-def _ensure_partition(path: Path, n_parts: int, seed: int) -> None:
+def ensure_partition(path: Path, n_parts: int, seed: int) -> None:
+    """Partition a model unless it is partitioned in as many parts."""
     if not store.has_partition(path, n_parts):
         divide(path, n_parts, seed)
 
 
-def _on_leader(world: World, work: Any) -> Any:
+def on_leader(world: World, work: Callable[[], Any]) -> Any:
     """The result of work, done by rank 0, on all ranks; its error likewise, before anything collective follows."""
     outcome: Any = None
     if world.leads:
@@ -205,6 +216,7 @@ class _Run:
             series=_SERIES,
         )
         begin = time.perf_counter()
+        _log.info("loop")
         try:
             self._advance(writer)
             self.phases.seconds["loop"] = time.perf_counter() - begin - self.phases.seconds.get("output", 0.0)
@@ -230,7 +242,7 @@ class _Run:
         with self.phases("report"):
             from mpitled import report
 
-            return _on_leader(self.world, lambda: report.write(self.directory, self.phases.seconds))
+            return on_leader(self.world, lambda: report.write(self.directory, self.phases.seconds))
 
     def _advance(self, writer: store.ResultWriter | None) -> None:
         """Steps, a survey and decisions, and so on to the end of the method."""
