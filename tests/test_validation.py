@@ -30,13 +30,12 @@ def test_a_scene_in_the_table(table, tmp_path, monkeypatch, capsys):
     )
     monkeypatch.setattr(table, "SCENES", (cube,))
     monkeypatch.setattr(table, "KINDS", {"none": "FE"})
-    meshes = ["deck's", "finest"]
-    rows = list(table.table_61(tmp_path, meshes))
+    rows = list(table.table_61(tmp_path, ["none"]))
     assert [(row["mesh"], row["failure"], row["cells"]) for row in rows] == [("deck's", "", 27), ("finest", "", 64)]
     for row in rows:
         assert row["all_norm"] < 0.01 < row["goal"] == 0.02
     assert capsys.readouterr().err.count("E3_cube_strain_50") == 2
-    again = list(table.table_61(tmp_path, meshes))
+    again = list(table.table_61(tmp_path, ["none"]))
     assert capsys.readouterr().err == ""  # nothing ran again
     assert again == rows
     again[1]["beyond_z"] = 0.021
