@@ -71,6 +71,7 @@ def draw_profiles(profiles: Sequence[Profile], path: Path) -> Figure:
     for (above, below), profile in zip(panels.T, profiles, strict=True):
         steps = np.linalg.norm(np.diff(profile.places, axis=0), axis=1)
         gaps = np.flatnonzero(steps > 4 * np.median(steps)) + 1
+        steps[gaps - 1] = np.median(steps)
         along = np.insert(np.cumsum(np.insert(steps, 0, 0.0)), gaps, np.nan)
 
         def line(displacement: NDArray[np.float64] | float, profile: Profile = profile, gaps: Any = gaps) -> Any:
@@ -82,12 +83,14 @@ def draw_profiles(profiles: Sequence[Profile], path: Path) -> Figure:
             label="reference",
         )  # fmt: skip
         for i, (label, displacement) in enumerate(profile.runs.items(), 1):
-            style: dict[str, Any] = {"color": _COLOURS[i], "linestyle": ("-", "--", "-.")[i % 3], "linewidth": 1.2}
+            style: dict[str, Any] = {"color": _COLOURS[i], "linestyle": ("--", "-", "-.")[i % 3], "linewidth": 1.2}
             above.plot(*line(displacement), label=label, **style)
             apart = np.linalg.norm(displacement - profile.reference, axis=1)
             below.plot(along, np.insert(apart, gaps, np.nan), label=label, **style)
-        above.set(title=profile.title, xlabel="x, mm", ylabel="z, mm", aspect="equal")
-        below.set(xlabel="along the undeformed line, mm", ylabel="distance from the reference, mm", ylim=(0, None))
+        wide, high = np.ptp((profile.places + profile.reference)[:, [0, 2]], axis=0)
+        aspect = "equal" if wide > high / 4 else "auto"  # one side alone shows nothing on equal scales
+        above.set(title=profile.title, xlabel="x, mm", ylabel="z, mm", aspect=aspect)
+        below.set(xlabel="along the undeformed line, mm", ylabel="distance from reference, mm", ylim=(0, None))
         below.grid(True, linewidth=0.3)
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
