@@ -91,3 +91,24 @@ def relaxed(relaxation):
                 term(s)
     assert not relaxation.stalled
     return s.u[:, : relaxation.sub.n_nodes].T.copy()
+
+
+def test_hexahedra_converge_with_the_square_of_their_size(tmp_path):
+    """On distorted cells; from above, for the coarse mesh's eight cells hold more than a wave."""
+    coarse, fine = (error(tmp_path, n, "none") for n in (8, 16))
+    assert 1.8 < np.log2(coarse / fine) < 2.4
+
+
+def test_the_mixed_mesh_converges_alike_only_where_constant_stress_is_in_balance(tmp_path):
+    """Without the correction of the gradients a constant stress is out of balance, by a share that no finer cloud makes
+    smaller: the error falls only as long as that is small beside the rest.
+    """
+    errors = {
+        consistency: [error(tmp_path, n, "core", consistency) for n in (8, 16)] for consistency in ("true", "false")
+    }
+    corrected, plain = (np.log2(coarse / fine) for coarse, fine in errors.values())
+    assert corrected > 1.8
+    assert plain < corrected
+    for better, worse in zip(errors["true"], errors["false"], strict=True):
+        assert better < worse
+    assert errors["false"][1] / errors["true"][1] > errors["false"][0] / errors["true"][0]
