@@ -116,7 +116,8 @@ def main() -> None:
         import felupe  # noqa: F401
         import pypardiso  # noqa: F401
     except ImportError as missing:
-        sys.exit(f"implicit.py: {missing.name} is missing; install it with: pip install -e '.[implicit]'")
+        print(f"implicit.py: {missing.name} is missing; install it with: pip install -e '.[implicit]'", file=sys.stderr)
+        sys.exit(2)
     OUT.mkdir(parents=True, exist_ok=True)
     todo = [
         (name, family, mesh)
