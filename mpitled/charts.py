@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -23,6 +24,16 @@ def _plain(value: float, _: Any) -> str:
     """A tick of a logarithmic axis as a plain number; of those between the powers of ten only some."""
     text = f"{value:g}"
     return text if text.strip("0.")[:1] in ("1", "2", "3", "5", "7") else ""
+
+
+def _logarithmic(axes: Axes, x: str, y: str) -> None:
+    """Both axes, labelled so, logarithmic with plain numbers, and a grid."""
+    axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(_plain)
+        axis.set_minor_formatter(_plain)
+    axes.margins(0.12)
+    axes.grid(True, which="both", linewidth=0.3)
 
 
 def draw_study(rows: list[dict[str, Any]], path: Path, error: str) -> None:
@@ -43,12 +54,7 @@ def draw_study(rows: list[dict[str, Any]], path: Path, error: str) -> None:
         [x for x, _ in best], [y for _, y in best], color=_INK, linestyle="--", linewidth=1, marker="o", markersize=12,
         markerfacecolor="none", label="none is better in both (Pareto)",
     )  # fmt: skip
-    axes.set(xscale="log", yscale="log", xlabel="time of the loop, s", ylabel=error)
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(_plain)
-        axis.set_minor_formatter(_plain)
-    axes.margins(0.12)
-    axes.grid(True, which="both", linewidth=0.3)
+    _logarithmic(axes, "time of the loop, s", error)
     axes.legend(fontsize=8)
     figure.savefig(path, dpi=150)
 
@@ -122,6 +128,7 @@ def draw_prediction(rows: list[dict[str, Any]], subject: str, assumptions: str, 
     axes.grid(True, linewidth=0.3)
     axes.legend(fontsize=8, loc="lower left")
     axes.set_title(f"{subject}: {assumptions}", fontsize=8, loc="left")
+    figure.savefig(path, dpi=150)
 
 
 def draw_quantities(
@@ -156,10 +163,28 @@ def draw_cost(points: Sequence[tuple[float, float, str]], path: Path) -> None:
     for seconds, error, name in points:
         axes.plot(seconds, error, color=_COLOURS[1], marker="o", linestyle="none")
         axes.annotate(name, (seconds, error), xytext=(6, 4), textcoords="offset points", fontsize=8)
-    axes.set(xscale="log", yscale="log", xlabel="time of the loop, s", ylabel="error estimate, mm")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(_plain)
-        axis.set_minor_formatter(_plain)
-    axes.margins(0.2)
-    axes.grid(True, which="both", linewidth=0.3)
+    _logarithmic(axes, "time of the loop, s", "error estimate, mm")
+    figure.savefig(path, dpi=150)
+
+
+def draw_rivals(panels: dict[str, list[dict[str, Any]]], path: Path, time: str, errors: Sequence[str]) -> None:
+    """Error against run time of programs ("family") that solve the same scenes: a panel each, a point for each mesh.
+
+    The panels' rows hold "seconds", "max_error_mm" and "unknowns"; `time` and, one for each panel, `errors` are labels.
+    """
+    figure = Figure(figsize=(6 * len(panels), 5.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    every = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axes, (title, rows), error in zip(every, panels.items(), errors, strict=True):
+        for i, family in enumerate(dict.fromkeys(row["family"] for row in rows)):
+            points = [row for row in rows if row["family"] == family]
+            seconds, found = ([row[name] for row in points] for name in ("seconds", "max_error_mm"))
+            colour = _COLOURS[i + 1]
+            axes.plot(seconds, found, label=family, linewidth=1.2, color=colour, marker=_MARKERS[i])
+            for x, y, row in zip(seconds, found, points, strict=True):
+                text = f"{row['unknowns']:,}"
+                axes.annotate(text, (x, y), xytext=(5, 4), textcoords="offset points", fontsize=7, color=colour)
+        _logarithmic(axes, time, error)
+        axes.set_title(title)
+    every[0].legend(fontsize=8, title="numbers: unknowns")
     figure.savefig(path, dpi=150)
