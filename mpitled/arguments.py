@@ -95,6 +95,14 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
     study.add_argument("--reference", type=Path, help="what errors are against (see compare); else the own estimate")
     study.add_argument("--beyond", type=float, metavar="MM", help="errors farther than this from prescribed edges")
 
+    stability = command(
+        "stability", "scenes taken to extremes: which complete, which stop; goes on where it was stopped"
+    )
+    stability.add_argument(
+        "--out", type=Path, default=Path("out/stability"), metavar="DIR", help="folder of the runs (%(default)s)"
+    )
+    stability.add_argument("--only", default="", metavar="AXIS,...", help="some of the axes, not all")
+
     bench = command("bench", "speed of the step on fixed scenes, against what the machine can do")
     bench.add_argument("--json", type=Path, metavar="FILE", help="write the outcome")
     bench.add_argument("--compare", type=Path, metavar="OLD.json", help="exit status 1 if a case is 10 %% slower")

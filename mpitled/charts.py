@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 #: Colours and marks of families of runs, told apart by the colour-blind (Okabe and Ito 2008).
@@ -188,3 +190,70 @@ def draw_rivals(panels: dict[str, list[dict[str, Any]]], path: Path, time: str, 
         axes.set_title(title)
     every[0].legend(fontsize=8, title="numbers: unknowns")
     figure.savefig(path, dpi=150)
+
+
+#: Outcomes of the stability matrix as colours of fill and text, of different lightness too.
+_OUTCOMES = {
+    "completed": ("#cbe7f8", _INK),
+    "stopped": ("#f0c75e", _INK),
+    "warned": ("#9c9c9c", _INK),
+    "wrong": ("#5a1f00", "#ffffff"),
+}
+_CELL = (0.92, 0.2)  # inches
+_MARGIN, _HEAD, _WIDTH = 1.5, 0.62, 5.9  # inches left of a panel's cells, above them, and of a panel with both
+_PANELS = 3  # beside one another
+
+
+def draw_matrix(rows: list[dict[str, Any]], path: Path) -> None:
+    """The stability matrix: a panel for each axis, kinds and methods down, values across, what became of it in words.
+
+    Completed runs have their error in mm, stopped ones the share of the load that they had, or that they were refused.
+    """
+    panels: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        panels.setdefault(row["axis"], []).append(row)
+    filled = [0.4] * _PANELS  # inches from the top, for the legend first
+    places = {}
+    for name, cells in panels.items():
+        column = filled.index(min(filled))
+        runs = list(dict.fromkeys((cell["kind"], cell["method"]) for cell in cells))
+        places[name] = column, filled[column], runs
+        filled[column] += _HEAD + _CELL[1] * len(runs)
+    width, height = _WIDTH * min(_PANELS, len(panels)), max(filled) + 0.1
+    figure = Figure(figsize=(width, height))
+    FigureCanvasAgg(figure)
+    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0))
+    axes.axis("off")
+    for i, (outcome, (colour, ink)) in enumerate(_OUTCOMES.items()):
+        _cell(axes, 0.1 + i * 1.2 * _CELL[0], 0.1, outcome, colour, ink)
+    said = "completed, warned, wrong: error, mm; stopped: share of the load reached"
+    axes.text(0.1 + 4.9 * _CELL[0], 0.2, said, fontsize=7, va="center", color=_INK)
+    for name, (column, top, runs) in places.items():
+        left, top = column * _WIDTH + _MARGIN, top + _HEAD
+        values = list(dict.fromkeys(cell["value"] for cell in panels[name]))
+        title = f"{name}: {panels[name][0]['about']}"
+        axes.text(left - _MARGIN + 0.1, top - 0.32, title, fontsize=8, fontweight="bold", color=_INK)
+        for i, value in enumerate(values):
+            axes.text(left + (i + 0.5) * _CELL[0], top - 0.05, value, fontsize=7, ha="center", color=_INK)
+        for j, (kind, method) in enumerate(runs):
+            y = top + (j + 0.5) * _CELL[1]
+            axes.text(left - 0.08, y, f"{kind}, {method}", fontsize=7, ha="right", va="center", color=_INK)
+        for cell in panels[name]:
+            i, j = values.index(cell["value"]), runs.index((cell["kind"], cell["method"]))
+            colours = _OUTCOMES[cell["outcome"]]
+            _cell(axes, left + i * _CELL[0], top + j * _CELL[1], _words(cell), *colours)
+    figure.savefig(path, dpi=150)
+
+
+def _cell(axes: Any, x: float, y: float, text: str, colour: str, ink: str) -> None:
+    axes.add_patch(Rectangle((x, y), *_CELL, facecolor=colour, edgecolor="#ffffff", linewidth=0.8))
+    middle = x + 0.5 * _CELL[0], y + 0.5 * _CELL[1]
+    axes.text(*middle, text, fontsize=7, ha="center", va="center", color=ink)
+
+
+def _words(cell: dict[str, Any]) -> str:
+    """What a cell of the matrix has to say."""
+    if cell["error_mm"] != "":
+        return f"{float(cell['error_mm']):.2g}"
+    reached = re.search(r"unstable at ([\d.]+%)", cell["message"])
+    return reached[1] if reached else {2: "refused", 0: "no reference"}.get(cell["status"], "no end")

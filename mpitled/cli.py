@@ -261,6 +261,15 @@ def _numbers(name: str, text: str) -> list[int]:
     return [int(word) for word in words]
 
 
+def _stability(options: argparse.Namespace) -> int:
+    from mpitled import stability
+
+    rows = stability.matrix(options.out, [name for name in options.only.split(",") if name])
+    print(stability.summary(rows))
+    print(f"written to {options.out}")
+    return 1 if any(row["outcome"] == stability.WRONG for row in rows) else 0
+
+
 def _info(options: argparse.Namespace) -> int:
     from mpitled import info
 
@@ -281,6 +290,7 @@ _COMMANDS: dict[str, Callable[[argparse.Namespace], int | None]] = {
     "report": _report,
     "compare": _compare,
     "study": _study,
+    "stability": _stability,
     "bench": _bench,
     "predict": _predict,
     "export": _export,

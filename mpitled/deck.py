@@ -282,6 +282,7 @@ class Output:
     """What is written."""
 
     frames: int = key("frames over the load, the undeformed one not counted", 10, limits="[1, inf)")
+    pictures: bool = key("draw the deformed body", True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

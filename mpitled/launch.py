@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import json
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -39,7 +40,8 @@ def command(verb: str, deck: Path, overrides: Sequence[str], ranks: int, folder:
 class Process:
     """A command at work in a folder of its own, where the log is what it says. It ends when this process is killed."""
 
-    def __init__(self, words: Sequence[str], folder: Path) -> None:
+    def __init__(self, words: Sequence[str], folder: Path, longest: int | None = None) -> None:
+        """Computing for longer (s) than that, it is killed."""
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
         # mpirun takes its ranks along when it is asked to end, and only then.
@@ -50,7 +52,7 @@ class Process:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                preexec_fn=lambda: _end_with_parent(last),
+                preexec_fn=lambda: _prepare(last, longest),
             )
 
     def ended(self, seconds: float | None = None) -> bool:
@@ -62,6 +64,11 @@ class Process:
         return True
 
     @property
+    def status(self) -> int:
+        """Its exit status, or minus the signal that killed it. It has to have ended."""
+        return int(self._process.returncode)
+
+    @property
     def failure(self) -> str:
         """Why it failed; "" if it did not. It has to have ended."""
         status = self._process.returncode
@@ -71,6 +78,8 @@ class Process:
         named = [line.removeprefix("mpitled: ") for line in lines if line.startswith("mpitled: ")]
         if status < 0 and not named:
             killed = f"killed by {signal.Signals(-status).name}"
+            if status == -signal.SIGXCPU:
+                return f"{killed}: it was not done in the time that it may compute for"
             return killed + (": perhaps the memory was not enough" if status == -signal.SIGKILL else "")
         return (named or lines or ["no reason given"])[-1]
 
@@ -80,9 +89,12 @@ class Process:
         self._process.wait()
 
 
-def _end_with_parent(last: int) -> None:
+def _prepare(last: int, longest: int | None) -> None:
+    """In the process to be: the signal that ends it with its parent, and the time that it may compute for."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, last)
+    if longest is not None:
+        resource.setrlimit(resource.RLIMIT_CPU, (longest, longest + 1))
 
 
 def said(folder: Path) -> list[str]:
@@ -107,12 +119,15 @@ def record(folder: Path, failure: str, **more: str) -> None:
     atomic.write_text(folder / DONE, json.dumps({"failure": failure, **more}))
 
 
-def run_apart(deck: Path, overrides: Sequence[str], ranks: int, folder: Path) -> str:
-    """Compute a deck in its folder, emptied before; the reason of its failure, "" if it is done."""
+def run_apart(deck: Path, overrides: Sequence[str], ranks: int, folder: Path, longest: int | None = None) -> str:
+    """Compute a deck in its folder, emptied before; the reason of its failure, "" if it is done.
+
+    If it computes for longer (s) than that it is killed.
+    """
     prepare(folder)
-    process = Process(command("run", deck, overrides, ranks, folder), folder)
+    process = Process(command("run", deck, overrides, ranks, folder), folder, longest)
     process.ended()
-    record(folder, process.failure)
+    record(folder, process.failure, status=str(process.status))
     return process.failure
 
 

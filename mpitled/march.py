@@ -21,6 +21,8 @@ from mpitled.survey import Survey
 #: The cells are surveyed at least so many times in a run, and at least once in so many steps: a survey takes about the
 #: time of one step and a half, below 2 % of a long run.
 SURVEYS, LONGEST_UNWATCHED = 100, 80
+#: More steps than that nobody waits for: they come of a slip in the units of a density or a modulus.
+MOST_STEPS = 1e8
 #: A step that was shortened grows again when it could be longer by this factor.
 REGAIN = 1.25
 
@@ -76,6 +78,11 @@ class March:
                     f"solver.time_step = {self.longest:g}: is longer than the critical step of the undeformed model, "
                     f"{critical:.3g} s; give at most {math.floor(critical * 1e8) / 1e8:g}, or leave it to auto"
                 )
+        if self.end / self.longest > MOST_STEPS:
+            raise InputError(
+                f"solver.load_time = {solver.load_time:g}: takes {self.end / self.longest:.2g} steps of "
+                f"{self.longest:.2g} s; check the units of densities and moduli, or shorten it"
+            )
         self.between = int(min(LONGEST_UNWATCHED, max(1, self.end / self.longest // SURVEYS)))
         s.time_step = self._fitting(self.longest, self.frame_span)
         np.divide(s.time_step**2, s.mass, out=s.mobility)

@@ -198,6 +198,19 @@ def check_solids(file: MeshFile) -> None:
     if file.refused:
         more = f" ({len(file.refused) - 1} more such)" if len(file.refused) > 1 else ""
         raise InputError(file.refused[0] + more)
+    for kind in meshfile.SOLIDS:
+        blocks = list(_elements(file, (kind,)))
+        if not blocks:
+            continue
+        nodes = blocks[0][0].nodes if len(blocks) == 1 else np.concatenate([block.nodes for block, _ in blocks])
+        rows = np.concatenate([rows for _, rows in blocks])
+        again, before = checks.repeated(nodes)
+        if len(again):
+            (block, number), (_, first) = (_element(file, int(rows[found[0]])) for found in (again, before))
+            raise InputError(
+                f"{block.origin}: element {number} has the same nodes as element {first}, and would count twice "
+                f"({len(again)} such); take one of the two out"
+            )
 
 
 def check_cloud(file: MeshFile) -> list[str]:

@@ -298,6 +298,14 @@ def test_a_step_above_the_critical_one_is_refused_with_the_one_to_use(tmp_path, 
     mpitled(*run, f"solver.time_step={longest}", "--set", "solver.load_time=0.05", n=n)
 
 
+def test_a_density_in_the_wrong_unit_is_refused_for_the_steps_that_it_takes(tmp_path):
+    """t/mm3 in place of kg/m3: a million times as many steps."""
+    path = deck(tmp_path, STRETCH, cloud="none", millimetres=3.0, load_time=1.0)
+    line = complaint(mpitled("run", path, "--out", tmp_path / "out", "--set", "material.brain.density=1e-9", status=2))
+    assert "solver.load_time = 1: takes" in line
+    assert "units of densities" in line
+
+
 @pytest.mark.parametrize("n", [1, 2])
 def test_an_unstable_run_stops_and_says_why(tmp_path, n):
     """A block pressed through itself: no step and no mass can save it."""
@@ -329,6 +337,23 @@ def test_an_unstable_run_recovers_on_request(tmp_path, method, keys):
     within = 1e-3 * report["static_distance_mm"] + 1e-5
     for found, safe in zip(final(tmp_path / "recovers"), final(tmp_path / "safe"), strict=True):
         assert np.abs(found - safe).max() < within
+
+
+@pytest.mark.parametrize("way", ["step_too_long", "not_a_number", "inverted_cell"])
+def test_what_one_of_four_ranks_breaks_ends_all_of_them_at_once(tmp_path, way):
+    """One message, and every rank is out of the command within a second of the survey that finds it."""
+    path = deck(tmp_path, STRETCH, cloud="core", millimetres=6.0, load_time=0.5)
+    script = Path(__file__).with_name("parallel_broken.py")
+    command = [*ranks(4), sys.executable, script, path, tmp_path / "out", way]
+    done = subprocess.run(command, env=ENVIRONMENT, cwd=ROOT, timeout=120, capture_output=True, text=True)
+    assert done.returncode == 3
+    line = complaint(done)
+    for word in ("unstable at", "mm", "J = ", "rank", "brain"):
+        assert word in line
+    ends = [json.loads((tmp_path / "out" / f"rank_{rank}.json").read_text()) for rank in range(4)]
+    assert [end["status"] for end in ends] == [3] * 4
+    assert sum("broken" in end for end in ends) == 1
+    assert max(end["ended"] for end in ends) - min(end["detected"] for end in ends) < 1.0
 
 
 @pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
