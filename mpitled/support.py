@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
-import scipy.sparse.linalg as linalg
 from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mpitled.coarse import AffineGrid, solve
 from mpitled.errors import InputError
 from mpitled.hexahedra import nodal_sum
 
@@ -268,18 +268,16 @@ def correct_consistency(
     n = domains.shape[1]
     projectors = np.eye(n) - 1 / n - centred @ inverse @ np.swapaxes(centred, 1, 2)
     system = _assemble(domains, volumes[:, None, None] * projectors, n_nodes)[free][:, free]
-    diagonal = system.diagonal()
-    preconditioner = sparse.diags(1 / np.where(diagonal > 0, diagonal, 1.0))
+    places = np.zeros((n_nodes, 3))
+    places[domains.ravel()] = nodes.reshape(-1, 3)
+    grid = AffineGrid(system, places[free])
     L = np.zeros((n_nodes, 3))
     corrected, after = gradients, before
     # Affine L do nothing, so that the system is singular where all is free. Its right-hand side has no part along them
     # but by round-off, which is not to be solved for: refinement ends where it no longer betters.
     while after > 1e-15:
-        for direction in range(3):
-            change, _ = linalg.cg(
-                system, -residual[free, direction], rtol=1e-14, atol=1e-15 * scale, maxiter=5_000, M=preconditioner
-            )
-            L[free, direction] += change
+        tolerance = np.maximum(1e-14 * np.linalg.norm(residual[free], axis=0), 1e-15 * scale)
+        L[free] -= solve(system, residual[free], grid, tolerance)
         trial = gradients + projectors @ L[domains]
         residual = fe_balance + nodal_sum(domains, volumes[:, None, None] * trial, n_nodes)
         left = float(np.abs(residual[free]).max() / scale)
