@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
 
 #: Colours and marks of families of runs, told apart by the colour-blind (Okabe and Ito 2008).
 _COLOURS = ("#000000", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -18,6 +26,16 @@ def _plain(value: float, _: Any) -> str:
     """A tick of a logarithmic axis as a plain number; of those between the powers of ten only some."""
     text = f"{value:g}"
     return text if text.strip("0.")[:1] in ("1", "2", "3", "5", "7") else ""
+
+
+def _logarithmic(axes: Axes, x: str, y: str) -> None:
+    """Both axes, labelled so, logarithmic with plain numbers, and a grid."""
+    axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(_plain)
+        axis.set_minor_formatter(_plain)
+    axes.margins(0.12)
+    axes.grid(True, which="both", linewidth=0.3)
 
 
 def draw_study(rows: list[dict[str, Any]], path: Path, error: str) -> None:
@@ -38,14 +56,54 @@ def draw_study(rows: list[dict[str, Any]], path: Path, error: str) -> None:
         [x for x, _ in best], [y for _, y in best], color=_INK, linestyle="--", linewidth=1, marker="o", markersize=12,
         markerfacecolor="none", label="none is better in both (Pareto)",
     )  # fmt: skip
-    axes.set(xscale="log", yscale="log", xlabel="time of the loop, s", ylabel=error)
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(_plain)
-        axis.set_minor_formatter(_plain)
-    axes.margins(0.12)
-    axes.grid(True, which="both", linewidth=0.3)
+    _logarithmic(axes, "time of the loop, s", error)
     axes.legend(fontsize=8)
     figure.savefig(path, dpi=150)
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """A line on a body's surface in the plane y = 0, deformed as a reference and as runs have it; all (n, 3), mm."""
+
+    title: str
+    places: NDArray[np.float64]  # undeformed, in order; a gap where they are far apart
+    reference: NDArray[np.float64]  # displacements
+    runs: dict[str, NDArray[np.float64]]  # label -> displacements
+
+
+def draw_profiles(profiles: Sequence[Profile], path: Path) -> Figure:
+    """Draw and save each profile as it is deformed, and below it how far each run is from the reference along it."""
+    figure = Figure(figsize=(4.6 * len(profiles), 8), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(2, len(profiles), squeeze=False, height_ratios=[2, 1])
+    for (above, below), profile in zip(panels.T, profiles, strict=True):
+        steps = np.linalg.norm(np.diff(profile.places, axis=0), axis=1)
+        gaps = np.flatnonzero(steps > 4 * np.median(steps)) + 1
+        steps[gaps - 1] = np.median(steps)
+        along = np.insert(np.cumsum(np.insert(steps, 0, 0.0)), gaps, np.nan)
+
+        def line(displacement: NDArray[np.float64] | float, profile: Profile = profile, gaps: Any = gaps) -> Any:
+            return np.insert(profile.places + displacement, gaps, np.nan, axis=0)[:, [0, 2]].T
+
+        above.plot(*line(0.0), color=_INK, linewidth=0.8, linestyle=":", label="undeformed")
+        above.plot(
+            *line(profile.reference), color=_INK, linestyle="", marker="o", markersize=5, markerfacecolor="none",
+            label="reference",
+        )  # fmt: skip
+        for i, (label, displacement) in enumerate(profile.runs.items(), 1):
+            style: dict[str, Any] = {"color": _COLOURS[i], "linestyle": ("--", "-", "-.")[i % 3], "linewidth": 1.2}
+            above.plot(*line(displacement), label=label, **style)
+            apart = np.linalg.norm(displacement - profile.reference, axis=1)
+            below.plot(along, np.insert(apart, gaps, np.nan), label=label, **style)
+        wide, high = np.ptp((profile.places + profile.reference)[:, [0, 2]], axis=0)
+        aspect = "equal" if wide > high / 4 else "auto"  # one side alone shows nothing on equal scales
+        above.set(title=profile.title, xlabel="x, mm", ylabel="z, mm", aspect=aspect)
+        below.set(xlabel="along the undeformed line, mm", ylabel="distance from reference, mm", ylim=(0, None))
+        below.grid(True, linewidth=0.3)
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+    figure.savefig(path, dpi=120)
+    return figure
 
 
 def draw_prediction(rows: list[dict[str, Any]], subject: str, assumptions: str, path: Path) -> None:
@@ -73,3 +131,129 @@ def draw_prediction(rows: list[dict[str, Any]], subject: str, assumptions: str, 
     axes.legend(fontsize=8, loc="lower left")
     axes.set_title(f"{subject}: {assumptions}", fontsize=8, loc="left")
     figure.savefig(path, dpi=150)
+
+
+def draw_quantities(
+    families: Mapping[str, Sequence[Mapping[str, Any]]], key: str, label: str, quantities: Mapping[str, str], path: Path
+) -> None:
+    """Each quantity (name: heading) of rows against their number under `key`, a line for each family of rows."""
+    across = min(4, math.ceil(len(quantities) ** 0.5) + 1)
+    down = math.ceil(len(quantities) / across)
+    figure = Figure(figsize=(3.4 * across, 2.7 * down + 0.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    for i, (name, heading) in enumerate(quantities.items(), 1):
+        axes = figure.add_subplot(down, across, i)
+        for j, (family, rows) in enumerate(families.items()):
+            points = sorted((row[key], row[name]) for row in rows if row.get(name, "") != "")
+            axes.plot(
+                [x for x, _ in points], [y for _, y in points], label=family or "here", linewidth=1, markersize=4,
+                color=_COLOURS[j % len(_COLOURS)], marker=_MARKERS[j % len(_MARKERS)],
+            )  # fmt: skip
+        axes.set(xlabel=label, ylabel=heading)
+        axes.grid(True, linewidth=0.3)
+    if len(families) > 1:
+        handles, names = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=min(4, len(families)), fontsize=8)
+    figure.savefig(path, dpi=150)
+
+
+def draw_cost(points: Sequence[tuple[float, float, str]], path: Path) -> None:
+    """Error estimate (mm) against the time of the loop (s) of runs, each with its name beside it."""
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for seconds, error, name in points:
+        axes.plot(seconds, error, color=_COLOURS[1], marker="o", linestyle="none")
+        axes.annotate(name, (seconds, error), xytext=(6, 4), textcoords="offset points", fontsize=8)
+    _logarithmic(axes, "time of the loop, s", "error estimate, mm")
+    figure.savefig(path, dpi=150)
+
+
+def draw_rivals(panels: dict[str, list[dict[str, Any]]], path: Path, time: str, errors: Sequence[str]) -> None:
+    """Error against run time of programs ("family") that solve the same scenes: a panel each, a point for each mesh.
+
+    The panels' rows hold "seconds", "max_error_mm" and "unknowns"; `time` and, one for each panel, `errors` are labels.
+    """
+    figure = Figure(figsize=(6 * len(panels), 5.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    every = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axes, (title, rows), error in zip(every, panels.items(), errors, strict=True):
+        for i, family in enumerate(dict.fromkeys(row["family"] for row in rows)):
+            points = [row for row in rows if row["family"] == family]
+            seconds, found = ([row[name] for row in points] for name in ("seconds", "max_error_mm"))
+            colour = _COLOURS[i + 1]
+            axes.plot(seconds, found, label=family, linewidth=1.2, color=colour, marker=_MARKERS[i])
+            for x, y, row in zip(seconds, found, points, strict=True):
+                text = f"{row['unknowns']:,}"
+                axes.annotate(text, (x, y), xytext=(5, 4), textcoords="offset points", fontsize=7, color=colour)
+        _logarithmic(axes, time, error)
+        axes.set_title(title)
+    every[0].legend(fontsize=8, title="numbers: unknowns")
+    figure.savefig(path, dpi=150)
+
+
+#: Outcomes of the stability matrix as colours of fill and text, of different lightness too.
+_OUTCOMES = {
+    "completed": ("#cbe7f8", _INK),
+    "stopped": ("#f0c75e", _INK),
+    "warned": ("#9c9c9c", _INK),
+    "wrong": ("#5a1f00", "#ffffff"),
+}
+_CELL = (0.92, 0.2)  # inches
+_MARGIN, _HEAD, _WIDTH = 1.5, 0.62, 5.9  # inches left of a panel's cells, above them, and of a panel with both
+_PANELS = 3  # beside one another
+
+
+def draw_matrix(rows: list[dict[str, Any]], path: Path) -> None:
+    """The stability matrix: a panel for each axis, kinds and methods down, values across, what became of it in words.
+
+    Completed runs have their error in mm, stopped ones the share of the load that they had, or that they were refused.
+    """
+    panels: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        panels.setdefault(row["axis"], []).append(row)
+    filled = [0.4] * _PANELS  # inches from the top, for the legend first
+    places = {}
+    for name, cells in panels.items():
+        column = filled.index(min(filled))
+        runs = list(dict.fromkeys((cell["kind"], cell["method"]) for cell in cells))
+        places[name] = column, filled[column], runs
+        filled[column] += _HEAD + _CELL[1] * len(runs)
+    width, height = _WIDTH * min(_PANELS, len(panels)), max(filled) + 0.1
+    figure = Figure(figsize=(width, height))
+    FigureCanvasAgg(figure)
+    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0))
+    axes.axis("off")
+    for i, (outcome, (colour, ink)) in enumerate(_OUTCOMES.items()):
+        _cell(axes, 0.1 + i * 1.2 * _CELL[0], 0.1, outcome, colour, ink)
+    said = "completed, warned, wrong: error, mm; stopped: share of the load reached"
+    axes.text(0.1 + 4.9 * _CELL[0], 0.2, said, fontsize=7, va="center", color=_INK)
+    for name, (column, top, runs) in places.items():
+        left, top = column * _WIDTH + _MARGIN, top + _HEAD
+        values = list(dict.fromkeys(cell["value"] for cell in panels[name]))
+        title = f"{name}: {panels[name][0]['about']}"
+        axes.text(left - _MARGIN + 0.1, top - 0.32, title, fontsize=8, fontweight="bold", color=_INK)
+        for i, value in enumerate(values):
+            axes.text(left + (i + 0.5) * _CELL[0], top - 0.05, value, fontsize=7, ha="center", color=_INK)
+        for j, (kind, method) in enumerate(runs):
+            y = top + (j + 0.5) * _CELL[1]
+            axes.text(left - 0.08, y, f"{kind}, {method}", fontsize=7, ha="right", va="center", color=_INK)
+        for cell in panels[name]:
+            i, j = values.index(cell["value"]), runs.index((cell["kind"], cell["method"]))
+            colours = _OUTCOMES[cell["outcome"]]
+            _cell(axes, left + i * _CELL[0], top + j * _CELL[1], _words(cell), *colours)
+    figure.savefig(path, dpi=150)
+
+
+def _cell(axes: Any, x: float, y: float, text: str, colour: str, ink: str) -> None:
+    axes.add_patch(Rectangle((x, y), *_CELL, facecolor=colour, edgecolor="#ffffff", linewidth=0.8))
+    middle = x + 0.5 * _CELL[0], y + 0.5 * _CELL[1]
+    axes.text(*middle, text, fontsize=7, ha="center", va="center", color=ink)
+
+
+def _words(cell: dict[str, Any]) -> str:
+    """What a cell of the matrix has to say."""
+    if cell["error_mm"] != "":
+        return f"{float(cell['error_mm']):.2g}"
+    reached = re.search(r"unstable at ([\d.]+%)", cell["message"])
+    return reached[1] if reached else {2: "refused", 0: "no reference"}.get(cell["status"], "no end")

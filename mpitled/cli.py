@@ -1,4 +1,5 @@
-"""The command line: `mpitled run|build|check|export|partition|report|compare|study|bench|predict|info`."""
+# PYTHON_ARGCOMPLETE_OK
+"""The command line: what each command does with its arguments."""
 
 from __future__ import annotations
 
@@ -7,20 +8,30 @@ import json
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
-from mpitled import __version__
+from mpitled import arguments
 from mpitled.errors import InputError, MpitledError
+
+if TYPE_CHECKING:
+    from mpitled.cases import Sweep
 
 # Modules are imported by the command that needs them: `--help` must not wait for compilers and libraries.
 
 
-def main(arguments: Sequence[str] | None = None) -> NoReturn:
+def main(words: Sequence[str] | None = None) -> NoReturn:
     """Run a command; exit status 0 done, 1 broken, 2 bad input, 3 unstable, 4 interrupted."""
-    options = _parser().parse_args(arguments)
+    parser = arguments.parser(_COMMANDS)
+    if "_ARGCOMPLETE" in os.environ:
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
+    options = parser.parse_args(words)
     try:
+        if options.verbose:
+            _log_phases()
         status = options.command(options)
     except MpitledError as error:
         _end(error, error.status)
@@ -45,103 +56,18 @@ def _end(error: Exception, status: int) -> NoReturn:
     world.abort(status)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="mpitled",
-        description="Brain deformation by tumour growth: coupled FE/EFG and explicit dynamics on MPI ranks.",
-    )
-    parser.add_argument("--version", action="version", version=f"mpitled {__version__}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+def _log_phases() -> None:
+    """Phases of the work on stderr, with the time and the rank."""
+    import logging
 
-    run = commands.add_parser("run", help="compute a deck; on N ranks: mpirun -n N mpitled run DECK")
-    _deck_arguments(run)
-    run.add_argument("-q", "--quiet", action="store_true", help="no progress and no table")
-    run.add_argument("--dry", action="store_true", help="say what would be done, and how long it would take; no step")
-    run.set_defaults(command=_run)
+    from mpitled.halo import World
 
-    build = commands.add_parser("build", help="build the model of a deck")
-    _deck_arguments(build)
-    build.set_defaults(command=_build)
-
-    check = commands.add_parser("check", help="check a mesh file or a deck, and say what is in it")
-    check.add_argument("file", type=Path, help="a mesh (Abaqus, LS-DYNA, or what meshio reads), or a deck (TOML)")
-    check.add_argument(
-        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override a key of the deck; repeatable"
-    )
-    check.set_defaults(command=_check)
-
-    export = commands.add_parser("export", help="write a model as decks that run to the same result, here or elsewhere")
-    export.add_argument("model", type=Path, help="model.h5, or the folder that holds it")
-    export.add_argument("--abaqus", action="store_true", required=True, help="as Abaqus decks and a CSV table")
-    export.add_argument("--out", type=Path, metavar="DIR", help="folder of the decks (export beside the model)")
-    export.set_defaults(command=_export)
-
-    part = commands.add_parser("partition", help="partition a model ahead of a job")
-    part.add_argument("model", type=Path, help="model.h5, or the folder that holds it")
-    part.add_argument("parts", type=int, help="number of ranks")
-    part.add_argument("--seed", type=int, default=0, help="METIS's seed (0)")
-    part.set_defaults(command=_partition)
-
-    report = commands.add_parser("report", help="table, report.json and pictures of a run")
-    report.add_argument("directory", type=Path, help="the folder that a run wrote")
-    report.set_defaults(command=_report)
-
-    compare = commands.add_parser("compare", help="errors of a result against a reference, in mm")
-    compare.add_argument("result", type=Path, help="the folder that a run wrote")
-    compare.add_argument(
-        "reference", type=Path, help=".npz, .csv, .vtu or .vtkhdf in metres, or a folder of another run"
-    )
-    compare.add_argument(
-        "--beyond", type=float, metavar="MM", help="also only places farther than this from edges of prescribed surface"
-    )
-    compare.add_argument("--json", action="store_true", help="JSON instead of a table")
-    compare.set_defaults(command=_compare)
-
-    study = commands.add_parser("study", help="error against run time over varied keys; goes on where it was stopped")
-    _deck_arguments(study)
-    study.add_argument(
-        "--vary",
-        action="append",
-        default=[],
-        metavar="KEY=A,B,...",
-        help="a family of runs; keys that go together: KEY=A,B+KEY=C,D; ranks=1,2 varies the ranks; repeatable",
-    )
-    study.add_argument("--reference", type=Path, help="what errors are against (see compare); else the own estimate")
-    study.add_argument("--beyond", type=float, metavar="MM", help="errors farther than this from prescribed edges")
-    study.set_defaults(command=_study)
-
-    bench = commands.add_parser("bench", help="speed of the step on fixed scenes, against what the machine can do")
-    bench.add_argument("--json", type=Path, metavar="FILE", help="write the outcome")
-    bench.add_argument("--compare", type=Path, metavar="OLD.json", help="exit status 1 if a case is 10 %% slower")
-    bench.add_argument("--ranks", metavar="N,...", help="numbers of ranks (1,2 where there are two cores)")
-    bench.add_argument("--quick", action="store_true", help="the smallest of each scene, in less time")
-    bench.add_argument("--omissions", action="store_true", help="instead: what each thing costs that a scene can lack")
-    bench.set_defaults(command=_bench)
-
-    predict = commands.add_parser("predict", help="efficiency on a cluster, from real partitions in many parts")
-    predict.add_argument("model", type=Path, help="model.h5, or the folder that holds it")
-    predict.add_argument(
-        "--parts", default="64,256,1024,4096,16384", metavar="N,...", help="numbers of ranks (%(default)s)"
-    )
-    predict.add_argument("--latency", type=float, metavar="US", help="microseconds a message takes (1.5)")
-    predict.add_argument("--bandwidth", type=float, metavar="GB/S", help="of one rank, in each direction (10)")
-    predict.add_argument("--rate", type=float, metavar="M", help="million hexahedra a second of one core (25)")
-    predict.add_argument("--fixed", type=float, metavar="US", help="microseconds of a step that depend on no size (15)")
-    predict.add_argument("--out", type=Path, metavar="DIR", help="folder of predict.csv and predict.png (the model's)")
-    predict.set_defaults(command=_predict)
-
-    info = commands.add_parser("info", help="versions of what mpitled works with, and what is missing; or of a file")
-    info.add_argument("file", type=Path, nargs="?", help="model.h5 or result.vtkhdf: say what it is and holds")
-    info.set_defaults(command=_info)
-    return parser
+    logging.basicConfig(format=f"%(asctime)s rank {World().rank}: %(message)s", level=logging.WARNING)
+    logging.getLogger("mpitled").setLevel(logging.INFO)
 
 
-def _deck_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("deck", type=Path, help="the scene, a TOML file")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results (out/NAME OF THE DECK)")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override a key of the deck; repeatable"
-    )
+def _print(figures: Any, table: Callable[[Any], str], options: argparse.Namespace) -> None:
+    print(json.dumps(figures, indent=2) if options.json else table(figures))
 
 
 def _output(options: argparse.Namespace) -> Path:
@@ -164,19 +90,69 @@ def _run(options: argparse.Namespace) -> None:
             print(told)
         return
     made = run(deck, _output(options), world, quiet=options.quiet)
-    if world.leads and not options.quiet:
+    if world.leads and (options.json or not options.quiet):
         from mpitled import report
 
-        print(report.table(made))
-        print(f"written to {_output(options)}")
+        _print(made, report.table, options)
+        if not options.json:
+            print(f"written to {_output(options)}")
+
+
+def _sweep(options: argparse.Namespace) -> int:
+    from mpitled import cases, sweep, vary
+    from mpitled.halo import World
+    from mpitled.run import everywhere
+
+    world = World()
+    with everywhere():  # each rank reads the same files
+        if options.deck.is_dir():
+            if options.vary or options.cases or options.set or options.out or options.ranks:
+                raise InputError(f"{options.deck}: goes on as it began; give the deck to vary, set or place it anew")
+            plan = cases.read(options.deck)
+        else:
+            if not options.vary and not options.cases:
+                raise InputError("sweep: nothing is varied; give --vary KEY=A,B,... or --cases CSV")
+            values = vary.table(options.cases) if options.cases else vary.grid(options.vary)
+            out = options.out or Path("out") / f"sweep_{options.deck.stem}"
+            plan = cases.plan(options.deck, values, options.set, options.ranks or 1, out)
+    if options.scheduler:
+        if world.leads:
+            print(sweep.array_job(plan, options.scheduler))
+        return 0
+    sweep.compute(plan, world, jobs=options.jobs, retry=options.retry, only=options.only)
+    return _tabulate(plan, options) if world.leads and not options.only else 0
+
+
+def _tabulate(plan: Sweep, options: argparse.Namespace) -> int:
+    """Write and print the table of a sweep; 3 if a case is broken."""
+    from mpitled import summary
+
+    table = summary.collect(plan, options.beside)
+    summary.write(plan, table)
+    if options.json:
+        print(json.dumps(summary.records(table), indent=2))
+    else:
+        print(f"{summary.text(table)}\nwritten to {plan.folder}")
+    if broken := [case for case in plan.cases if case.failure]:
+        print(f"{len(broken)} broken; --retry computes them again", file=sys.stderr)
+    return 3 if broken else 0
+
+
+def _new(options: argparse.Namespace) -> None:
+    from mpitled import scaffold
+
+    for path in scaffold.write(options.kind, options.file or Path(f"{options.kind}.toml")):
+        print(path)
 
 
 def _build(options: argparse.Namespace) -> None:
     from mpitled.deck import load_deck
-    from mpitled.run import build
+    from mpitled.run import build, ensure_partition
     from mpitled.store import describe_model
 
-    path, built = build(load_deck(options.deck, options.set), _output(options))
+    deck = load_deck(options.deck, options.set)
+    path, built = build(deck, _output(options))
+    ensure_partition(path, options.ranks, deck.partition.seed)
     print(f"{path}: {'built' if built else 'up to date'}")
     print(describe_model(path))
 
@@ -184,7 +160,10 @@ def _build(options: argparse.Namespace) -> None:
 def _check(options: argparse.Namespace) -> None:
     from mpitled import overview
 
-    print(overview.check(options.file, options.set))
+    if options.json:
+        print(json.dumps(overview.figures(options.file, options.set), indent=2))
+    else:
+        print(overview.check(options.file, options.set))
 
 
 def _export(options: argparse.Namespace) -> None:
@@ -210,17 +189,20 @@ def _partition(options: argparse.Namespace) -> None:
     print(divide(path, options.parts, options.seed))
 
 
-def _report(options: argparse.Namespace) -> None:
-    from mpitled import report
+def _report(options: argparse.Namespace) -> int:
+    from mpitled import cases, report
 
-    print(report.table(report.write(options.directory)))
+    if cases.is_sweep(options.directory):
+        return _tabulate(cases.read(options.directory), options)
+    _print(report.write(options.directory), report.table, options)
+    return 0
 
 
 def _compare(options: argparse.Namespace) -> None:
     from mpitled import compare
 
     figures = compare.compare(options.result, options.reference, options.beyond and options.beyond / 1e3)
-    print(json.dumps(figures, indent=2) if options.json else compare.table(figures))
+    _print(figures, compare.table, options)
 
 
 def _study(options: argparse.Namespace) -> None:
@@ -279,11 +261,38 @@ def _numbers(name: str, text: str) -> list[int]:
     return [int(word) for word in words]
 
 
+def _stability(options: argparse.Namespace) -> int:
+    from mpitled import stability
+
+    rows = stability.matrix(options.out, [name for name in options.only.split(",") if name])
+    print(stability.summary(rows))
+    print(f"written to {options.out}")
+    return 1 if any(row["outcome"] == stability.WRONG for row in rows) else 0
+
+
 def _info(options: argparse.Namespace) -> int:
     from mpitled import info
 
-    if options.file:
-        print(info.describe(options.file))
-        return 0
-    print(info.table())
-    return 0 if info.complete() else 1
+    if options.json:
+        print(json.dumps(info.contents(options.file) if options.file else info.versions(), indent=2))
+    else:
+        print(info.describe(options.file) if options.file else info.table())
+    return 0 if options.file or info.complete() else 1
+
+
+_COMMANDS: dict[str, Callable[[argparse.Namespace], int | None]] = {
+    "run": _run,
+    "sweep": _sweep,
+    "new": _new,
+    "check": _check,
+    "build": _build,
+    "partition": _partition,
+    "report": _report,
+    "compare": _compare,
+    "study": _study,
+    "stability": _stability,
+    "bench": _bench,
+    "predict": _predict,
+    "export": _export,
+    "info": _info,
+}

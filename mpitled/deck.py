@@ -11,7 +11,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import MISSING, Field, asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from types import UnionType
@@ -19,7 +19,7 @@ from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_ty
 
 from mpitled.errors import InputError
 from mpitled.material import Material
-from mpitled.mesh import Constraint, Rotation
+from mpitled.mesh import METRES, Constraint, Rotation
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -84,6 +84,7 @@ class Block:
     elements: tuple[int, int, int] = key("hexahedra along x, y, z", limits="[1, inf)")
     cloud: Literal["none", "core", "all"] = key("what the cloud replaces: nothing, an inner block, everything", "none")
     core_share: float = key('share of each edge that `cloud = "core"` replaces', 0.5, limits="(0, 1)")
+    fitted: str | None = key("name of a [sphere.NAME] that hexahedra follow; `elements` are then along the edges", None)
 
 
 _Length = Literal["m", "cm", "mm"]
@@ -99,6 +100,11 @@ class Cylinder:
     element_size: float = key("edge of a hexahedron, in the mean", 5.0, "mm", "(0, inf)")
     cloud: Literal["none", "core", "all"] = key("what the cloud replaces: nothing, the inner part, everything", "none")
     core_share: float = key('share of radius and height that `cloud = "core"` replaces', 0.5, limits="(0, 1)")
+    grading: float = key(
+        'thickness of the layers at both ends and of the outermost ring as a share of the mean; 1 with `cloud = "all"`',
+        0.3,
+        limits="(0, 1]",
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,6 +115,11 @@ class Ellipsoid:
     element_size: float = key("edge of a hexahedron, in the mean", 5.0, "mm", "(0, inf)")
     cloud: Literal["none", "core", "all"] = key("what the cloud replaces: nothing, the inner part, everything", "none")
     core_share: float = key('share of the semi-axes that `cloud = "core"` replaces', 0.5, limits="(0, 1)")
+    grading: float = key(
+        'size of elements beside the edges of patch and fixed as a share of the mean; 1 with `cloud = "all"`',
+        1.0,
+        limits="(0, 1]",
+    )
     cavity: Literal["fitted", "moved"] = key(
         "seed without a cloud: shells around it, or one hexahedron whose nodes move (the paper)", "fitted"
     )
@@ -206,6 +217,15 @@ class MaterialSection:
         return Material(self.name, self.youngs_modulus, self.poissons_ratio, self.density)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sphere:
+    """Cells whose middle lies in a sphere make the cell set NAME, for a material's `cells`; NAME is free."""
+
+    name: str
+    centre: tuple[float, float, float] = key("its centre", unit="mm")
+    radius: float = key("its radius", unit="mm", limits="(0, inf)")
+
+
 _XYZ = Literal["x", "y", "z"]
 
 
@@ -222,7 +242,11 @@ class Displaced:
     """Nodes that are moved along the loading curve; any number of these."""
 
     nodes: str = key("name of a node set")
-    displacement: tuple[float, ...] = key("displacement at full load, one for each direction", unit="mm")
+    displacement: tuple[float, ...] | None = key("displacement at full load, one for each direction", None, "mm")
+    field: Path | None = key(
+        "instead: CSV of x, y, z, ux, uy, uz, places and their displacements, carried over to the nodes", None
+    )
+    field_unit: _Length | None = key("unit of length of `field`; mm unless given", None)
     directions: tuple[_XYZ, ...] = key("directions that are prescribed; the others stay free", ("x", "y", "z"))
     rotation: float = key("angle at full load, by which the nodes are turned as well", 0.0, "degrees", "[-360, 360]")
     axis: _XYZ = key("direction of the rotation's axis", "z")
@@ -240,9 +264,17 @@ class Solver:
     hold_time: float = key("quasi-static, dynamic: duration after it, at full load", 0.0, "s", "[0, inf)")
     load_steps: int = key("dynamic-relaxation: steps in which the load grows", 500, limits="[1, inf)")
     tolerance: float = key("dynamic-relaxation ends this near to the static solution", 0.01, "mm", "(0, inf)")
-    time_step: Literal["auto"] | float = key("time step; auto: from the stability bound", "auto", "s", "(0, inf)")
-    safety: float = key("share of the stability bound that the step takes", 0.8, limits="(0, 1]")
+    time_step: Literal["auto"] | float = key(
+        "time step, at most; auto: the longest stable one times safety", "auto", "s", "(0, inf)"
+    )
+    safety: float = key("share of the longest stable step, by power iteration, that is taken", 0.8, limits="(0, 1]")
     mass_scaling: bool = key("quasi-static: raise the mass of nodes that the step is too long for", True)
+    on_inversion: Literal["stop", "recover"] = key(
+        "an unstable run stops, or goes back a little and on with a stricter step (at most 5 times)", "stop"
+    )
+    precision: Literal["double", "single"] = key(
+        "arithmetic of the cells' forces; nodes always move in double", "double"
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -250,6 +282,7 @@ class Output:
     """What is written."""
 
     frames: int = key("frames over the load, the undeformed one not counted", 10, limits="[1, inf)")
+    pictures: bool = key("draw the deformed body", True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -273,6 +306,7 @@ class Deck:
     cloud: Cloud = field(default_factory=Cloud)
     support: Support = field(default_factory=Support)
     hexahedra: Hexahedra = field(default_factory=Hexahedra)
+    spheres: tuple[Sphere, ...] = field(default=(), metadata={"section": "sphere"})
     materials: tuple[MaterialSection, ...] = field(default=(), metadata={"section": "material"})
     fixed: tuple[Fixed, ...] = ()
     displaced: tuple[Displaced, ...] = ()
@@ -288,7 +322,11 @@ class Deck:
         for i, moved in enumerate(self.displaced):
             turn = Rotation(moved.rotation, "xyz".index(moved.axis), moved.centre)
             origin = f"{self.path}: displaced.{i}.nodes"
-            yield Constraint(moved.nodes, _axes(moved), moved.displacement, origin, turn if turn.angle else None)
+            axes, rotation = _axes(moved), turn if turn.angle else None
+            displacement = moved.displacement or (0.0,) * len(axes)
+            yield Constraint(
+                moved.nodes, axes, displacement, origin, rotation, moved.field, METRES[moved.field_unit or "mm"]
+            )
 
 
 def _axes(section: Fixed | Displaced) -> tuple[int, ...]:
@@ -620,8 +658,17 @@ def _check(deck: Deck, source: _Source) -> None:
                 named[label] = name
     if deck.tumour:
         _check_tumour(deck, given, source)
+    spheres = [sphere.name for sphere in deck.spheres]
+    if deck.block and deck.block.fitted is not None and deck.block.fitted not in spheres:
+        what = f"is none of the spheres ({', '.join(spheres) or 'there are none'}); add [sphere.{deck.block.fitted}]"
+        raise source.error("block.fitted", what, deck.block.fitted)
     for i, moved in enumerate(deck.displaced):
-        if len(moved.displacement) != len(moved.directions):
+        if moved.displacement is None and moved.field is None:
+            what = "is missing; give a list of numbers, in mm, or displaced.field, a CSV of places and displacements"
+            raise source.error(f"displaced.{i}.displacement", what)
+        if moved.displacement and moved.field:
+            raise source.error(f"displaced.{i}.field", "is there beside displacement; give one of the two")
+        if moved.displacement and len(moved.displacement) != len(moved.directions):
             what = f"has not one number for each of {_show(moved.directions)}; give {len(moved.directions)}, in mm"
             raise source.error(f"displaced.{i}.displacement", what, given["displaced"][i]["displacement"])
         if moved.rotation and set("xyz") - {moved.axis} - set(moved.directions):
@@ -672,7 +719,7 @@ def canonical(deck: Deck) -> dict[str, Any]:
     return plain(deck)
 
 
-_MODEL = (*GEOMETRIES, "tumour", "cloud", "support", "hexahedra", "materials", "fixed", "displaced")
+_MODEL = (*GEOMETRIES, "tumour", "cloud", "support", "hexahedra", "spheres", "materials", "fixed", "displaced")
 
 
 def model_key(deck: Deck, included: Sequence[Path] = ()) -> str:
@@ -680,15 +727,24 @@ def model_key(deck: Deck, included: Sequence[Path] = ()) -> str:
 
     `included` are files that those of the deck read in turn.
     """
+    return _content(deck, _MODEL, included, program=program())
+
+
+def scene_key(deck: Deck, included: Sequence[Path] = ()) -> str:
+    """What determines the result, whatever the program: all sections, like `model_key`."""
+    return _content(deck, (f.name for f in fields(deck) if f.name not in ("title", "path")), included)
+
+
+def _content(deck: Deck, names: Iterable[str], included: Sequence[Path], **more: str) -> str:
     sections = asdict(deck)
-    content: dict[str, Any] = {"program": _program()} | {name: sections[name] for name in _MODEL}
+    content: dict[str, Any] = more | {name: sections[name] for name in names}
     if included:
         content["included"] = list(included)
     return json.dumps(content, sort_keys=True, separators=(",", ":"), default=_digest)
 
 
 @functools.cache
-def _program() -> str:
+def program() -> str:
     """This program by its sources: a model that others built may differ from what they would build."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
@@ -702,6 +758,40 @@ def _digest(path: Path) -> str:
         while part := file.read(1 << 20):
             digest.update(part)
     return f"sha256:{digest.hexdigest()}"
+
+
+def keys() -> list[str]:
+    """Every "section.key" of sections that are there once, whatever they are called."""
+    return [f"{home[1:-1]}.{about[0]}" for home, _, about in _declared() if about and re.fullmatch(r"\[\w+\]", home)]
+
+
+class Declared(NamedTuple):
+    """What people are told of a key."""
+
+    meaning: str
+    expected: str  # "a number above 0, in mm"
+    default: Any  # in the deck's unit; None where there is none
+
+
+def declared(home: str) -> tuple[str, dict[str, Declared]]:
+    """What a section is, written as "[labels]", "[material.NAME]" or "[[fixed]]", and its keys."""
+    about, found = "", {}
+    for of, section, entry in _declared():
+        if of == home and entry:
+            written, hint, key = entry
+            default = None if key.default is MISSING else key.default
+            found[written] = Declared(key.meaning, _expected(hint, key), default)
+        elif of == home:
+            about = (section.__doc__ or "").strip()
+    return about, found
+
+
+def unit_of(name: str) -> str:
+    """Unit of the key "section.key" in a deck; "" if it has none, or there is no such key."""
+    section, _, written = name.rpartition(".")
+    home = section.partition(".")[0]
+    declared = {(of.strip("[]").partition(".")[0], about[0]): about[2].unit for of, _, about in _declared() if about}
+    return declared.get((home, written), "")
 
 
 def markdown_table() -> str:

@@ -31,6 +31,8 @@ def dry_run(deck: Deck, directory: Path, world: World) -> str:
     """
     run = runs.prepare(deck, directory, world)
     run.warm_up()
+    with runs.everywhere():
+        run.method.begin()
     method, sub = run.method, run.sub
     terms = [(name, partial(act, method.state)) for name, act in (*method.forces, *method.motion)]
     calls, surveyed = witness(terms), witness([("survey", method.look)])
@@ -141,6 +143,7 @@ _ABSENT: dict[str, Callable[[Deck], str]] = {
     "position": lambda deck: f"support.stabilisation = {deck.support.stabilisation:g}",
     "inverse": lambda deck: f"support.stabilisation = {deck.support.stabilisation:g}",
     "mass": lambda deck: "relaxation has no inertia where nodes are moved",
+    "copied": lambda deck: f'solver.precision = "{deck.solver.precision}"',
     "tensor": lambda deck: f'solver.method = "{deck.solver.method}": masses are scalars',
 }
 

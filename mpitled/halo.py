@@ -28,16 +28,21 @@ def library_version() -> str:
 
 
 class World:
-    """All ranks of the job. Every method is collective: reached by every rank or by none."""
+    """All ranks of the job, or a group of them. Every method is collective: reached by every rank or by none."""
 
-    def __init__(self) -> None:
-        self.comm: Any = None
-        self.rank, self.size = 0, 1
-        if any(int(os.environ.get(name, "1")) > 1 for name in _SIZES):
+    def __init__(self, comm: Any = None) -> None:
+        """comm: of a group, see `split`; without it all ranks that were started."""
+        if comm is None and any(int(os.environ.get(name, "1")) > 1 for name in _SIZES):
             from mpi4py import MPI
 
-            self.comm = MPI.COMM_WORLD
-            self.rank, self.size = self.comm.rank, self.comm.size
+            comm = MPI.COMM_WORLD
+        self.rank: int = 0 if comm is None else comm.rank
+        self.size: int = 1 if comm is None else comm.size
+        self.comm: Any = comm if self.size > 1 else None
+
+    def split(self, size: int) -> World:
+        """This rank's group, where so many ranks in turn make one."""
+        return World(self.comm.Split(self.rank // size, self.rank))
 
     @property
     def leads(self) -> bool:
@@ -76,15 +81,21 @@ class Halo:
     Requests are persistent and the buffers are made once: nothing is allocated in an exchange.
     """
 
-    def __init__(self, world: World, shared: Sequence[tuple[int, NDArray[np.uint32]]], components: int) -> None:
+    def __init__(
+        self,
+        world: World,
+        shared: Sequence[tuple[int, NDArray[np.uint32]]],
+        components: int,
+        precision: type[np.floating] = np.float64,
+    ) -> None:
         """shared: (rank, nodes shared with it) in ascending order of rank; both sides list the same nodes."""
         self.components = components
         self.seconds = {"pack": 0.0, "wait": 0.0, "unpack": 0.0}
         self._all = np.unique(np.concatenate([nodes for _, nodes in shared])) if shared else np.zeros(0, np.uint32)
-        own = np.empty((components, len(self._all)))
+        own = np.empty((components, len(self._all)), precision)
         self._own = own
-        sends = [np.empty((components, len(nodes))) for _, nodes in shared]
-        receives = [np.empty((components, len(nodes))) for _, nodes in shared]
+        sends = [np.empty((components, len(nodes)), precision) for _, nodes in shared]
+        receives = [np.empty((components, len(nodes)), precision) for _, nodes in shared]
         self._packs = [(nodes, buffer) for (_, nodes), buffer in zip(shared, sends, strict=True)]
         turns = [(rank, nodes, buffer) for (rank, nodes), buffer in zip(shared, receives, strict=True)]
         turns.append((world.rank, self._all, own))
@@ -100,7 +111,7 @@ class Halo:
             self._requests += [comm.Send_init(b, rank) for (rank, _), b in zip(shared, sends, strict=True)]
             self._start, self._wait = MPI.Prequest.Startall, MPI.Request.Waitall
 
-    def sum(self, values: NDArray[np.float64]) -> None:
+    def sum(self, values: NDArray[np.floating]) -> None:
         """values (components, n_nodes) at shared nodes <- the sum over the ranks that share them."""
         clock = time.perf_counter
         begin = clock()

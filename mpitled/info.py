@@ -7,7 +7,7 @@ import platform
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mpitled import __version__
 from mpitled.errors import InputError
@@ -41,31 +41,55 @@ def complete() -> bool:
     return not any(part.needed and part.version is None for part in _parts())
 
 
-def describe(path: Path) -> str:
-    """What a model or a result is and holds. InputError if it is neither."""
+def versions() -> dict[str, str | None]:
+    """Version of each part; None where it is missing."""
+    return {part.name: part.version for part in _parts()}
+
+
+def contents(path: Path) -> dict[str, Any]:
+    """What a model or a result is and holds, as JSON can hold it. InputError if it is neither."""
     from mpitled import store
 
     if path.is_dir():
         raise InputError(f"{path}: is a folder; give a file in it, model.h5 or result.vtkhdf")
     if store.model_key(path) is not None:
-        return f"{path}: a model of mpitled\n{store.describe_model(path)}"
+        return {"kind": "model", "path": str(path), **store.model_contents(path)}
     with store.open_result(path) as result:
         metadata, times = result.metadata, result.times
-        versions = ", ".join(f"{name} {version}" for name, version in metadata["versions"].items())
-        reached = times[-1] if len(times) else 0.0
-        n_nodes = len(result.at_nodes("node_id"))
         n_hexahedra = len(result.hexahedra)
-        n_domains = len(result.in_cells("cell_id")) - n_hexahedra
-        lines = [
-            f"{path}: {'a whole' if result.complete else 'an unfinished'} result of mpitled",
-            f"title            {metadata['title']}",
-            f"frames           {result.n_frames}, to {reached:g} s of {metadata['load_time_s']:g} s",
-            f"nodes            {n_nodes}",
-            f"hexahedra        {n_hexahedra}",
-            f"support domains  {n_domains}",
-            f"ranks            {metadata['ranks']}",
-            f"versions         {versions}",
-        ]
+        return {
+            "kind": "result",
+            "path": str(path),
+            "complete": result.complete,
+            "title": metadata["title"],
+            "frames": result.n_frames,
+            "time_s": float(times[-1]) if len(times) else 0.0,
+            "load_time_s": metadata["load_time_s"],
+            "nodes": len(result.at_nodes("node_id")),
+            "hexahedra": n_hexahedra,
+            "support_domains": len(result.in_cells("cell_id")) - n_hexahedra,
+            "ranks": metadata["ranks"],
+            "versions": metadata["versions"],
+        }
+
+
+def describe(path: Path) -> str:
+    """The same for people to read."""
+    has = contents(path)
+    if has["kind"] == "model":
+        from mpitled import store
+
+        return f"{path}: a model of mpitled\n{store.describe_model(path)}"
+    lines = [
+        f"{path}: {'a whole' if has['complete'] else 'an unfinished'} result of mpitled",
+        f"title            {has['title']}",
+        f"frames           {has['frames']}, to {has['time_s']:g} s of {has['load_time_s']:g} s",
+        f"nodes            {has['nodes']}",
+        f"hexahedra        {has['hexahedra']}",
+        f"support domains  {has['support_domains']}",
+        f"ranks            {has['ranks']}",
+        f"versions         {', '.join(f'{name} {version}' for name, version in has['versions'].items())}",
+    ]
     return "\n".join(lines)
 
 
@@ -91,6 +115,10 @@ def _parts() -> list[_Part]:
         package("meshio", "meshes of other programs"),
         package("nibabel", "label images", "images", needed=False),
         package("matplotlib", "the report's pictures", "pictures", needed=False),
+        package("argcomplete", "completion in the shell", "completion", needed=False),
+        package("pandas", "tables in Python", "python", needed=False),
+        package("pyvista", "meshes in Python", "python", needed=False),
+        package("xarray", "arrays with names in Python", "python", needed=False),
         package("tqdm", "the progress bar", "progress", needed=False),
     ]
 

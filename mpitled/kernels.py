@@ -705,42 +705,47 @@ def react(u, u_prev, f, mass, dofs, full, amplitude, reaction, time_step):  # ty
 
 
 @_inline
-def _prescribe(u, fixed, dofs, full, amplitude):  # type: ignore[no-untyped-def]
-    zero = u.dtype.type(0)
+def _prescribe(u, fixed, dofs, full, amplitude, copied):  # type: ignore[no-untyped-def]
     for p in range(fixed.size):
-        u[fixed[p] % 3, fixed[p] // 3] = zero
+        u[fixed[p] % 3, fixed[p] // 3] = 0
+        if copied is not None:
+            copied[fixed[p] % 3, fixed[p] // 3] = 0
     for p in range(dofs.size):
         u[dofs[p] % 3, dofs[p] // 3] = amplitude * full[p]
+        if copied is not None:
+            copied[dofs[p] % 3, dofs[p] // 3] = amplitude * full[p]
 
 
 @_kernel
-def update(u, u_prev, f, mobility, fixed, dofs, full, amplitude):  # type: ignore[no-untyped-def]
+def update(u, u_prev, f, mobility, fixed, dofs, full, amplitude, copied):  # type: ignore[no-untyped-def]
     """The central difference (eq. 3.3, with the square on dt that 3.2 lacks), then the prescribed dofs; clears f.
 
     mobility (n_nodes,) is dt^2 / m, s^2/kg. The new displacements overwrite u_prev: the caller swaps the two.
-    fixed (n,) are the dofs that stay, dofs and full (m,) those that move.
+    fixed (n,) are the dofs that stay, dofs and full (m,) those that move. copied, if given, takes the new displacements
+    in its own precision: a slow ramp's accelerations would be lost in displacements of single precision.
     """
-    zero = u.dtype.type(0)
     for c in range(3):
         now = u[c]
         before = u_prev[c]
         fc = f[c]
         for n in range(U(mobility.size)):
-            before[n] = (now[n] - before[n]) + now[n] - mobility[n] * fc[n]
-            fc[n] = zero
-    _prescribe(u_prev, fixed, dofs, full, amplitude)
+            after = (now[n] - before[n]) + now[n] - mobility[n] * fc[n]
+            before[n] = after
+            fc[n] = 0
+            if copied is not None:
+                copied[c, n] = after
+    _prescribe(u_prev, fixed, dofs, full, amplitude, copied)
 
 
 @_kernel
-def relax(u, u_prev, f, mobility, counted, fixed, dofs, full, amplitude, retain, gain):  # type: ignore[no-untyped-def]
+def relax(u, u_prev, f, mobility, counted, fixed, dofs, full, amplitude, retain, gain, copied):  # type: ignore[no-untyped-def]
     """As `update`, with a mobility tensor at each node (6, n_nodes: xx, xy, xz, yy, yz, zz) and damping.
 
     u+ = u + retain (u - u_prev) - gain mobility f: with damping c per step, (2 - c) / (2 + c) and 2 / (2 + c).
     Returns the work (J) of the internal forces where counted (3, n_nodes) is 1 and not 0, at free dofs that the rank
     owns: each force times the mean of the steps before and after it.
     """
-    zero = u.dtype.type(0)
-    half = u.dtype.type(0.5)
+    half = 0.5
     work = 0.0
     for n in range(U(counted.shape[1])):
         fx = f[0, n]
@@ -760,10 +765,14 @@ def relax(u, u_prev, f, mobility, counted, fixed, dofs, full, amplitude, retain,
         u_prev[0, n] = x
         u_prev[1, n] = y
         u_prev[2, n] = z
-        f[0, n] = zero
-        f[1, n] = zero
-        f[2, n] = zero
-    _prescribe(u_prev, fixed, dofs, full, amplitude)
+        f[0, n] = 0
+        f[1, n] = 0
+        f[2, n] = 0
+        if copied is not None:
+            copied[0, n] = x
+            copied[1, n] = y
+            copied[2, n] = z
+    _prescribe(u_prev, fixed, dofs, full, amplitude, copied)
     return work
 
 
@@ -780,27 +789,28 @@ def change_step(u, u_prev, f, mobility, ratio):  # type: ignore[no-untyped-def]
             u_prev[c, n] = now - ratio * (now - u_prev[c, n]) + (gain - 1) * mobility[n] * f[c, n]
 
 
-@njit(cache=True)
-def kinetic_energy(u, u_prev, f, mass, counted, held, time_step):  # type: ignore[no-untyped-def]
+@_kernel
+def kinetic_energy(u, u_prev, f, mass, mobility, counted, held, time_step):  # type: ignore[no-untyped-def]
     """Kinetic energy (J) of the counted nodes at the middle of the two half steps around u.
 
     held (n,) are the prescribed dofs: theirs is taken from the last half step, for f does not move them.
-    No fast arithmetic here: a NaN anywhere must come out as NaN.
     """
-    energy = 0.0
+    half = u.dtype.type(0.5)
+    twice = 0.0
     for c in range(3):
-        for n in range(counted.size):
-            if counted[n]:
-                v = (u[c, n] - u_prev[c, n]) / time_step - 0.5 * time_step * f[c, n] / mass[n]
-                energy += 0.5 * mass[n] * v * v
+        now = u[c]
+        before = u_prev[c]
+        fc = f[c]
+        for n in range(U(mass.size)):
+            v = now[n] - before[n] - half * mobility[n] * fc[n]
+            twice += counted[n] * mass[n] * v * v
     for p in range(held.size):
         n = held[p] // 3
         c = held[p] % 3
-        if counted[n]:
-            v = (u[c, n] - u_prev[c, n]) / time_step
-            w = v - 0.5 * time_step * f[c, n] / mass[n]
-            energy += 0.5 * mass[n] * (v * v - w * w)
-    return energy
+        v = u[c, n] - u_prev[c, n]
+        w = v - half * mobility[n] * f[c, n]
+        twice += counted[n] * mass[n] * (v * v - w * w)
+    return 0.5 * twice / (time_step * time_step)
 
 
 @njit(cache=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,8 @@ from numpy.typing import NDArray
 from mpitled.errors import InputError
 from mpitled.material import Material
 
+#: Units of length of decks and files, in m.
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 #: Corners of the reference hexahedron in the Abaqus/VTK order (paper, eq. 4.4).
 CORNERS = np.array([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
 
@@ -33,6 +36,8 @@ class Constraint:
     displacement: tuple[float | NDArray[np.float64], ...]
     origin: str = ""  # file and line or key, for messages
     rotation: Rotation | None = None  # beside the displacement
+    field: Path | None = None  # beside both: displacements at places, see `mapping`
+    field_metre: float = 1.0  # its unit of length, m
 
 
 @dataclass(frozen=True, slots=True)

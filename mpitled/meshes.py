@@ -21,7 +21,7 @@ from mpitled import abaqus, checks, hexahedra, lsdyna, meshfile, tables
 from mpitled.cloud import subdivide, volumes_and_centroids
 from mpitled.errors import InputError
 from mpitled.material import Material
-from mpitled.mesh import Constraint, Mesh
+from mpitled.mesh import METRES, Constraint, Mesh
 from mpitled.meshfile import Cells, MeshFile
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 DENSITY = 1000.0
 #: Integration volumes that miss the void's by more than this share are warned about.
 FILLED = 0.01
-_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _PASCALS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9}
 _DENSITIES = {"kg/m3": 1.0, "g/cm3": 1e3, "kg/mm3": 1e9, "t/mm3": 1e12}
 #: Solids of real matter; what is outside is a slip of units.
@@ -199,6 +198,19 @@ def check_solids(file: MeshFile) -> None:
     if file.refused:
         more = f" ({len(file.refused) - 1} more such)" if len(file.refused) > 1 else ""
         raise InputError(file.refused[0] + more)
+    for kind in meshfile.SOLIDS:
+        blocks = list(_elements(file, (kind,)))
+        if not blocks:
+            continue
+        nodes = blocks[0][0].nodes if len(blocks) == 1 else np.concatenate([block.nodes for block, _ in blocks])
+        rows = np.concatenate([rows for _, rows in blocks])
+        again, before = checks.repeated(nodes)
+        if len(again):
+            (block, number), (_, first) = (_element(file, int(rows[found[0]])) for found in (again, before))
+            raise InputError(
+                f"{block.origin}: element {number} has the same nodes as element {first}, and would count twice "
+                f"({len(again)} such); take one of the two out"
+            )
 
 
 def check_cloud(file: MeshFile) -> list[str]:
@@ -375,7 +387,7 @@ def assemble(section: deck.MeshFiles, fe: MeshFile, efg: MeshFile | None, seed_v
     if efg:
         check_solids(efg)
         remarks += efg.remarks + _others(efg)
-    metre = _METRES[section.unit]
+    metre = METRES[section.unit]
     taken = _taken(section, fe)
     fe_points = fe.points * metre if metre != 1 else fe.points
     cells, parents, said = _hexahedra(fe, fe_points, taken, section.repair)
@@ -392,7 +404,7 @@ def assemble(section: deck.MeshFiles, fe: MeshFile, efg: MeshFile | None, seed_v
     interface = np.empty(0, np.int64)
     cloud, corners = _Cloud(), np.empty((0, 8, 3))
     if efg:
-        efg_metre = _METRES[section.efg_unit or section.unit]
+        efg_metre = METRES[section.efg_unit or section.unit]
         efg_points = efg.points * efg_metre
         efg_map, interface = _merge(efg, efg_points, points, section.merge_tolerance)
         new = efg_map >= n_fe_nodes
@@ -510,7 +522,7 @@ def _integration(
     void = dropped if len(dropped) else own
     if section.integration_points:
         points, volumes, sets = tables.read_grid(section.integration_points)
-        metre = _METRES[section.integration_unit or section.unit]
+        metre = METRES[section.integration_unit or section.unit]
         return _Cloud(points * metre, volumes * metre**3, sets), void
     if len(dropped):
         k = section.cuts

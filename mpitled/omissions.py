@@ -26,12 +26,12 @@ class Scene:
     hourglass: float
     stabilisation: float
     relaxed: bool = True
-    precision: str = "float64"
+    precision: type[np.floating] = np.float64
 
     def composed(self) -> Pace:
         """The step of this scene."""
-        sub = localise(self.rows, self.hourglass, self.stabilisation, "mean")
-        return made(sub, World(), self.precision, relaxed=self.relaxed)
+        sub = localise(self.rows, self.hourglass, self.stabilisation, "mean", self.precision)
+        return made(sub, World(), relaxed=self.relaxed)
 
 
 def _one_material(scene: Scene) -> Scene:
@@ -56,7 +56,7 @@ OMISSIONS: dict[str, Callable[[Scene], Scene]] = {
     "turning nodes": _straight,
     "moving nodes": _fixed,
     "mass tensors, damping": lambda s: replace(s, relaxed=False),
-    "double precision": lambda s: replace(s, precision="float32"),
+    "double precision": lambda s: replace(s, precision=np.float32),
 }
 
 

@@ -14,13 +14,12 @@ from typing import Any
 import numpy as np
 
 from mpitled import limits, store
-from mpitled.flops import with_values
 from mpitled.halo import Halo, World
 from mpitled.step import State, Term, at_rest, compose_forces, compose_march, compose_relaxation
 from mpitled.subdomain import Subdomain, localise
 from mpitled.witness import Call, distinct_bytes, witness
 
-PRECISIONS = ("float64", "float32")
+PRECISIONS: dict[str, type[np.floating]] = {"float64": np.float64, "float32": np.float32}
 #: How often a case is timed, and for how many seconds each time; the median counts.
 REPEATS, SPAN = 9, 0.2
 QUICK_REPEATS, QUICK_SPAN = 5, 0.05
@@ -60,8 +59,8 @@ class Pace:
         }
 
 
-def made(sub: Subdomain, world: World, precision: str, relaxed: bool = False) -> Pace:
-    """The step of a part in a precision, marching or in relaxation, in a state that is strained by about 1 %."""
+def made(sub: Subdomain, world: World, relaxed: bool = False) -> Pace:
+    """The step of a part, marching or in relaxation, in a state that is strained by about 1 %."""
     state = at_rest(sub, 1.0, _TIME_STEP)
     if relaxed:
         mobility = state.mobility
@@ -70,12 +69,10 @@ def made(sub: Subdomain, world: World, precision: str, relaxed: bool = False) ->
     x = sub.rows.points.T
     x = (x - x.mean(axis=1, keepdims=True)) / np.ptp(x)
     strained = _STRAIN * np.ptp(sub.rows.points) * (x[[1, 2, 0]] + np.sin(2 * np.pi * _WAVES * x) / (6 * _WAVES))
-    state.u[:, : sub.n_nodes] = state.u_prev[:, : sub.n_nodes] = strained
+    state.place(strained)
     state.time = _SHARE * state.load_time
-    sub, state = (with_values(part, lambda values: values.astype(precision)) for part in (sub, state))
-    halo = Halo(world, sub.shared, 3) if world.size > 1 else None
-    counted = np.ones((3, sub.n_nodes), precision)
-    motion = compose_relaxation(sub, counted) if relaxed else compose_march(sub)
+    halo = Halo(world, sub.shared, 3, sub.precision) if world.size > 1 else None
+    motion = compose_relaxation(sub, np.ones((3, sub.n_nodes))) if relaxed else compose_march(sub)
     return Pace(sub, state, (*compose_forces(sub, halo), *motion), halo)
 
 
@@ -134,8 +131,10 @@ def _cases(
 ) -> list[dict[str, Any]]:
     """The case of each precision of a scene. Collective."""
     rows = store.read_part(Path(scene["model"]), world.size, world.rank)
-    sub = localise(rows, scene["hourglass"], scene["stabilisation"], "mean")
-    paces = {precision: made(sub, world, precision) for precision in PRECISIONS}
+    paces = {
+        name: made(localise(rows, scene["hourglass"], scene["stabilisation"], "mean", precision), world)
+        for name, precision in PRECISIONS.items()
+    }
     calls = {precision: pace.witnessed() for precision, pace in paces.items()}
     loops = dict.fromkeys(PRECISIONS, 0.0)
     for pace in paces.values():
@@ -153,7 +152,7 @@ def _cases(
         size = distinct_bytes(calls[precision])
         bound, by_memory = roofline(pace, calls[precision], operations, multiply_adds[precision], limits.triad(size, 3))
         waited = sum(pace.halo.seconds.values()) if pace.halo else 0.0
-        table = world.gather([sub.n_cells, size, waited / loops[precision], bound, by_memory])
+        table = world.gather([pace.sub.n_cells, size, waited / loops[precision], bound, by_memory])
         cells, sizes, halo_shares, bounds, memory = table.T
         made_cases.append(
             {

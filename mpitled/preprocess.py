@@ -11,6 +11,7 @@ from mpitled import block, checks, hexahedra, labels, phantoms, support
 from mpitled.deck import Deck
 from mpitled.errors import InputError
 from mpitled.loading import growth, turn
+from mpitled.mapping import carry_over
 from mpitled.material import Material
 from mpitled.mesh import Mesh, named_set
 from mpitled.model import Model
@@ -22,11 +23,28 @@ OUTER = ("skull", "surface")
 
 
 def read_mesh(deck: Deck) -> Mesh:
-    """The mesh of a deck's one geometry section."""
+    """The mesh of a deck's one geometry section, with the cell sets of its spheres."""
+    mesh = _geometry(deck)
+    if not deck.spheres:
+        return mesh
+    middles = np.concatenate([mesh.points[mesh.hexahedra].mean(axis=1), mesh.integration_points])
+    cell_sets = dict(mesh.cell_sets)
+    for sphere in deck.spheres:
+        origin = f"{deck.path}: sphere.{sphere.name}"
+        if sphere.name in cell_sets:
+            raise InputError(f"{origin}: there is a cell set of that name already; give it another")
+        inside = np.flatnonzero(np.linalg.norm(middles - np.asarray(sphere.centre), axis=1) <= sphere.radius)
+        if not len(inside):
+            raise InputError(f"{origin}: no cell has its middle in it; move or enlarge it, or make the cells smaller")
+        cell_sets[sphere.name] = inside
+    return replace(mesh, cell_sets=cell_sets)
+
+
+def _geometry(deck: Deck) -> Mesh:
     if deck.labels:
         return labels.mesh_labels(deck.labels, deck.cloud, deck.tumour)
     if deck.block:
-        return block.block_mesh(deck.block, deck.cloud, deck.tumour)
+        return block.block_mesh(deck.block, deck.cloud, deck.tumour, deck.spheres)
     if deck.cylinder:
         return phantoms.cylinder_mesh(deck.cylinder, deck.cloud, deck.tumour)
     if deck.ellipsoid:
@@ -90,7 +108,6 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
     # Next to a seed the cloud is fine: a few heavier nodes there cost less than its short step everywhere.
     in_cloud = np.isin(loose, domains) if len(loose) else np.zeros(len(points), bool)
     figures |= {
-        "critical_step_min_s": float(critical.min()),
         "critical_step_typical_s": float(np.median(critical if in_cloud.all() else critical[~in_cloud])),
         "mass_kg": float(cell_mass.sum()),
         "volume_m3": float(fe_volumes.sum() + volumes.sum()),
@@ -256,6 +273,9 @@ def prescribe(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.flo
         turned, arcs = np.zeros((len(nodes), 3)), np.zeros((len(nodes), 3, 3))
         if constraint.rotation:
             turned, arcs = turn(mesh.points[nodes], constraint.rotation)
+        if constraint.field:
+            where = constraint.origin.removesuffix("nodes") + "field"
+            turned = turned + carry_over(constraint.field, constraint.field_metre, mesh.points[nodes], where)
         for direction, displacement in zip(constraint.directions, constraint.displacement, strict=True):
             dofs.append(3 * nodes + direction)
             values.append(displacement + turned[:, direction])

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from copy import copy, deepcopy
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mpitled import kernels
 from mpitled.deck import Solver
-from mpitled.halo import Halo
+from mpitled.halo import Halo, World
+from mpitled.sharpness import Sharpness
 from mpitled.step import State, at_rest, compose_forces, compose_relaxation, rehearse
 from mpitled.subdomain import Subdomain
 from mpitled.survey import Survey
@@ -21,6 +23,8 @@ BETWEEN = 10
 KEEP = 0.9
 #: The estimate has to hold at so many surveys in a row.
 SETTLED = 3
+#: It has stalled when so many surveys in a row have not brought the least estimate down by this factor: round-off.
+STALLED, BETTER = 300, 0.99
 
 
 class Relaxation:
@@ -34,31 +38,49 @@ class Relaxation:
     speed over its frequency and as its acceleration over its frequency squared, whichever is more.
     """
 
-    def __init__(self, solver: Solver, frames: int, sub: Subdomain, force_halo: Halo | None, halo: Halo | None) -> None:
+    def __init__(
+        self,
+        solver: Solver,
+        frames: int,
+        sub: Subdomain,
+        world: World,
+        force_halo: Halo | None,
+        halo: Halo | None,
+    ) -> None:
         """halo sums six components."""
         self.sub, self.halo, self.safety, self.frames = sub, halo, solver.safety, frames
         self.tolerance = solver.tolerance
         self.between = BETWEEN
-        self.state = at_rest(sub, float(solver.load_steps), 1.0)
+        self.load_time = float(solver.load_steps)
+        self.state = at_rest(sub, self.load_time, 1.0)
         self.state.mass = np.zeros((6, sub.n_nodes))
         self.state.mobility = np.zeros((6, sub.n_nodes))
         self.survey = Survey(sub)
         self.required = np.zeros((6, sub.n_nodes))
-        self.free = np.ones((3, sub.n_nodes))
-        for held in (sub.fixed, sub.moving):
-            self.free[held % 3, held // 3] = 0
+        self.free = sub.free()
         self.counted: NDArray[np.float64] = self.free * sub.rows.owned  # free dofs that this rank owns
         self.u_then, self.f_then = np.zeros((3, sub.n_nodes)), np.zeros((3, sub.n_nodes))
         self.lowest, self.distance, self.frame, self.settled = 0.0, math.inf, 0, 0
+        self.best, self.waited = math.inf, 0
         self.forces, self.motion = compose_forces(sub, force_halo), compose_relaxation(sub, self.counted)
+        self.sharpness = Sharpness(sub, world, self.forces, self.free)
 
     def start_from(self, s: State, energy: float) -> None:
         """Go on from the displacements of another run at the end of its load, at rest; `energy` (J) is in its cells."""
-        self.state.u[:] = self.state.u_prev[:] = s.u
+        self.state.place(s.u)
         self.state.time = self.state.load_time
         self.u_then[:] = s.u[:, : self.sub.n_nodes]
         self.state.external_work = energy
         self.frame = self.frames
+
+    def begin(self) -> None:
+        """Find how sharp the bound of stiffness is. Collective."""
+        self._bound()
+
+    @property
+    def stalled(self) -> bool:
+        """Whether it comes no nearer to the static solution, though that is farther than the tolerance."""
+        return self.waited >= STALLED
 
     @property
     def frame_time(self) -> float:
@@ -77,7 +99,8 @@ class Relaxation:
     def warm_up(self) -> None:
         """Call every kernel once, on the state at rest, without other ranks."""
         twin = copy(self)
-        twin.state, twin.halo = deepcopy(self.state), None
+        twin.state, twin.halo, twin.sharpness = deepcopy(self.state), None, copy(self.sharpness)
+        twin.sharpness.wait, twin.sharpness.share = 1, 1.0
         twin.u_then, twin.f_then = self.u_then.copy(), self.f_then.copy()
         rehearse(twin.state, (*self.forces, *self.motion))
         twin.look()
@@ -88,12 +111,7 @@ class Relaxation:
         More sums: "rayleigh_force", "rayleigh_mass". More extremes: "change", "residual" (m).
         """
         s = self.state
-        self.required[:] = 0
-        found = self.survey.look(s, self.safety, self.required)
-        for diagonal in (0, 3, 5):
-            self.required[diagonal] += self.survey.required[0]
-        if self.halo is not None:
-            self.halo.sum(self.required)
+        found = self._bound()
         kernels.renew_tensors(s.mass, self.required, s.mobility, self.free, KEEP)
         kinetic, work, force, mass, change, residual = kernels.watch_relaxation(
             s.u, s.u_prev, s.f, s.mass, s.mobility, self.counted, self.u_then, self.f_then
@@ -111,6 +129,40 @@ class Relaxation:
             "residual": residual,
         }
 
+    def remember(self) -> dict[str, Any]:
+        """All that `recall` needs to come back to the present."""
+        names = ("state", "u_then", "f_then", "lowest", "distance", "frame", "settled", "best", "waited")
+        return {name: deepcopy(getattr(self, name)) for name in names}
+
+    def recall(self, saved: dict[str, Any]) -> None:
+        for name, value in deepcopy(saved).items():
+            setattr(self, name, value)
+
+    def harden(self) -> None:
+        """Go on from rest, with masses twice as large and the load half as fast, watched twice as often."""
+        self.state.place(self.state.u)
+        self.safety /= math.sqrt(2)
+        self.between = max(1, self.between // 2)
+        self.load_time *= 2
+        self.state.time *= self.load_time / self.state.load_time
+        self.state.load_time = self.load_time
+
+    def _bound(self) -> dict[str, float]:
+        """Survey, and fill `required` with the masses that a stable step needs, on all ranks."""
+        s = self.state
+        self.required[:] = 0
+        found = self.survey.look(s, self.safety, self.required)
+        for diagonal in (0, 3, 5):
+            self.required[diagonal] += self.survey.required[0]
+        if self.halo is not None:
+            self.halo.sum(self.required)
+        if self.sharpness.due() and (s.share < 1 or self.sharpness.share == 0):
+            mobility = np.empty_like(self.required)
+            kernels.renew_tensors(np.zeros_like(self.required), self.required, mobility, self.free, 0.0)
+            self.sharpness.renew(s, mobility, (2 * self.safety) ** 2)
+        self.required *= self.sharpness.share
+        return found
+
     def decide(self, figures: dict[str, float]) -> tuple[bool, bool]:
         """Damping of the next steps; whether a frame is due now, and whether the static solution is reached."""
         s = self.state
@@ -124,7 +176,10 @@ class Relaxation:
             self.settled = self.settled + 1 if steady and self.distance < self.tolerance else 0
         damping = 2 * math.sqrt(self.lowest)
         s.retain, s.gain = (2 - damping) / (2 + damping), 2 / (2 + damping)
-        if self.settled >= SETTLED:
+        if self.distance < BETTER * self.best:
+            self.best, self.waited = self.distance, 0
+        self.waited += loaded
+        if self.settled >= SETTLED or self.stalled:
             return True, True
         due = self.frame < self.frames and s.share >= self.frame / self.frames
         self.frame += due

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import hexahedra, store
+from mpitled import atomic, hexahedra, store
 from mpitled.cloud import boundary_faces, interface_faces
 from mpitled.errors import InputError
 from mpitled.model import Model
@@ -71,14 +70,7 @@ def write(directory: Path, seconds: Mapping[str, float] | None = None) -> dict[s
     phases = dict(seconds or report.get("seconds", {}))
     report["seconds"] = phases | {"report": time.perf_counter() - begin}
     report = _without_nan(report)
-    temporary = directory / f".{REPORT}.{os.getpid()}"
-    try:
-        temporary.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n")
-        os.replace(temporary, directory / REPORT)
-    except OSError as error:
-        raise InputError(f"{directory / REPORT}: cannot be written ({error.strerror})") from None
-    finally:
-        temporary.unlink(missing_ok=True)
+    atomic.write_text(directory / REPORT, json.dumps(report, indent=2, allow_nan=False) + "\n")
     return report
 
 
@@ -241,6 +233,8 @@ def _rim(faces: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def _draw(outcome: Outcome, directory: Path) -> list[str] | str:
     """Names of the pictures drawn, or why there are none."""
+    if not outcome.metadata["deck"]["output"].get("pictures", True):
+        return "none, for output.pictures is false"
     try:
         import matplotlib  # noqa: F401  (optional: only the pictures need it)
     except ImportError:

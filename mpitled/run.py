@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import importlib.metadata
+import logging
 import math
 import resource
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -27,19 +30,22 @@ from mpitled.march import March
 from mpitled.relaxation import Relaxation
 from mpitled.step import Term
 from mpitled.subdomain import Subdomain, localise
+from mpitled.watch import Watch
 
 #: Cost in a step of a node of a support domain, in hexahedra, as `pytest -m study tests/test_kernels.py` measures it.
 DOMAIN_NODE_COST = 0.3
-#: The energy balance may be wrong by this share of the largest energy; beyond it the run is unstable.
-BALANCE_LIMIT = 0.05
-#: So many steps from rest the ledger is too coarse to judge by: its trapezoidal rule is wrong by about 8 over the steps
-#: squared of what little energy there is.
-LEDGER_STARTS = 50
+#: Looks from one state that recovery can go back to until the next, and how often a run may go back.
+SAVED, RECOVERIES = 5, 5
+#: What `solver.precision` means for the cells' arithmetic.
+PRECISIONS: dict[str, type[np.floating]] = {"double": np.float64, "single": np.float32}
 
 MODEL = "model.h5"
 
 #: What ends a run in order. mpirun kills its ranks itself when it gets one of the first two; the third it passes on.
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+
+
+_log = logging.getLogger(__name__)
 
 
 class Phases:
@@ -51,6 +57,8 @@ class Phases:
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
         begin = time.perf_counter()
+        if name not in self.seconds:
+            _log.info("%s", name)
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
 
@@ -58,12 +66,7 @@ class Phases:
 def build(deck: Deck, directory: Path) -> tuple[Path, bool]:
     """The model of a deck in directory/model.h5, and whether it had to be built: the same deck uses it again."""
     path = directory / MODEL
-    included: list[Path] = []
-    if deck.mesh:
-        from mpitled import meshes
-
-        included = meshes.files(deck.mesh)
-    key = decks.model_key(deck, included)
+    key = decks.model_key(deck, included(deck))
     if store.model_key(path) == key:
         return path, False
     directory.mkdir(parents=True, exist_ok=True)
@@ -71,6 +74,15 @@ def build(deck: Deck, directory: Path) -> tuple[Path, bool]:
 
     store.write_model(path, preprocess.build(deck), key, decks.canonical(deck))
     return path, True
+
+
+def included(deck: Deck) -> list[Path]:
+    """Files that those of the deck read in turn."""
+    if not deck.mesh:
+        return []
+    from mpitled import meshes
+
+    return meshes.files(deck.mesh)
 
 
 def divide(path: Path, n_parts: int, seed: int) -> str:
@@ -99,17 +111,19 @@ def prepare(deck: Deck, directory: Path, world: World, *, quiet: bool = False) -
     """All that is done before the first step of `run`: model, partition, this rank's part, and the composed step."""
     phases = Phases()
     with phases("model"):
-        path = _on_leader(world, lambda: build(deck, directory)[0])
+        path = on_leader(world, lambda: build(deck, directory)[0])
     if world.leads and not quiet:
         for remark in store.read_remarks(path):
             print(f"note: {remark}", file=sys.stderr, flush=True)
     with phases("partition"):
         if world.size > 1:
-            _on_leader(world, lambda: _ensure_partition(path, world.size, deck.partition.seed))
+            on_leader(world, lambda: ensure_partition(path, world.size, deck.partition.seed))
     with phases("read"):
         rows = store.read_part(path, world.size, world.rank)
         rule = deck.hexahedra.gradient
-        sub = localise(rows, deck.hexahedra.hourglass, deck.support.stabilisation, rule)
+        sub = localise(
+            rows, deck.hexahedra.hourglass, deck.support.stabilisation, rule, PRECISIONS[deck.solver.precision]
+        )
         figures = store.read_figures(path)
     with everywhere():  # each rank finds the same
         return _Run(deck, directory, world, sub, figures, phases, quiet)
@@ -125,12 +139,13 @@ def everywhere() -> Iterator[None]:
         raise
 
 
-def _ensure_partition(path: Path, n_parts: int, seed: int) -> None:
+def ensure_partition(path: Path, n_parts: int, seed: int) -> None:
+    """Partition a model unless it is partitioned in as many parts."""
     if not store.has_partition(path, n_parts):
         divide(path, n_parts, seed)
 
 
-def _on_leader(world: World, work: Any) -> Any:
+def on_leader(world: World, work: Callable[[], Any]) -> Any:
     """The result of work, done by rank 0, on all ranks; its error likewise, before anything collective follows."""
     outcome: Any = None
     if world.leads:
@@ -143,10 +158,6 @@ def _on_leader(world: World, work: Any) -> Any:
         if isinstance(outcome, MpitledError):
             raise outcome
     return outcome
-
-
-#: What is not summed over the ranks.
-_EXTREMES = {"min_jacobian": min, "step_ratio": max, "change": max, "residual": max}
 
 
 class _Run:
@@ -163,35 +174,38 @@ class _Run:
         quiet: bool,
     ) -> None:
         self.deck, self.directory, self.world, self.sub, self.phases = deck, directory, world, sub, phases
-        self.force_halo = self._halo(3)
+        self.force_halo = self._halo(3, sub.precision)
         solver, frames = deck.solver, deck.output.frames
         self.method: March | Relaxation
         if solver.method == "dynamic-relaxation":
             self.method = self._relaxation()
         else:
-            self.method = March(solver, frames, sub, self.force_halo, self._halo(1), model)
+            self.method = March(solver, frames, sub, world, self.force_halo, self._halo(1), model)
         self.progress = None if quiet or not world.leads else _Progress()
-        self.interrupted = 0
+        self.interrupted = False
         self.term_seconds: dict[str, float] = {}
-        self.largest_kinetic_ratio = 0.0
-        self.largest_energy = 0.0
-        self.own_energy = 0.0  # J, in this rank's cells
         self.distance = math.nan
-        # The strain energy of the undeformed body is no better than this, J: tr C - 3 and ln J are not quite 0.
-        self.noise = 8 * np.finfo(float).eps * max(m.mu for m in sub.rows.materials) * model["volume_m3"]
-        self.figures: dict[str, float] = {}
+        self.volume = model["volume_m3"]
+        self.watch = Watch(world, sub, self.volume)
+        self.recoveries = 0
+        self.written = -math.inf  # time of the last frame
+        # The displacements that were good at the last look, their frame's time, and what was seen of them.
+        self.good, self.good_time, self.good_figures = np.zeros((3, sub.n_nodes)), 0.0, self.watch.figures
 
-    def _halo(self, components: int) -> Halo | None:
-        return Halo(self.world, self.sub.shared, components) if self.world.size > 1 else None
+    def _halo(self, components: int, precision: type[np.floating] = np.float64) -> Halo | None:
+        return Halo(self.world, self.sub.shared, components, precision) if self.world.size > 1 else None
 
     def _relaxation(self) -> Relaxation:
-        return Relaxation(self.deck.solver, self.deck.output.frames, self.sub, self.force_halo, self._halo(6))
+        deck, halo = self.deck, self._halo(6)
+        return Relaxation(deck.solver, deck.output.frames, self.sub, self.world, self.force_halo, halo)
 
     # ------------------------------------------------------------ the loop
 
     def run(self) -> dict[str, Any]:
         with self.phases("compile"):
             self.warm_up()
+        with self.phases("begin"), everywhere():
+            self.method.begin()
         previous = {s: signal.signal(s, self._interrupt) for s in INTERRUPTS}
         writer = store.ResultWriter(
             self.directory,
@@ -202,12 +216,15 @@ class _Run:
             series=_SERIES,
         )
         begin = time.perf_counter()
+        _log.info("loop")
         try:
             self._advance(writer)
             self.phases.seconds["loop"] = time.perf_counter() - begin - self.phases.seconds.get("output", 0.0)
             made = self._run_figures(self.phases.seconds["loop"])
             if isinstance(self.method, Relaxation):
-                self.distance = self.method.distance
+                self.distance = self.method.best if self.method.stalled else self.method.distance
+                with everywhere():
+                    self._end_if_stalled(self.method)
             elif self.deck.solver.method == "quasi-static":
                 with self.phases("static distance"):
                     self.distance = self._distance_to_static()
@@ -225,49 +242,94 @@ class _Run:
         with self.phases("report"):
             from mpitled import report
 
-            return _on_leader(self.world, lambda: report.write(self.directory, self.phases.seconds))
+            return on_leader(self.world, lambda: report.write(self.directory, self.phases.seconds))
 
     def _advance(self, writer: store.ResultWriter | None) -> None:
         """Steps, a survey and decisions, and so on to the end of the method."""
         method, clock = self.method, time.perf_counter
-        state, forces, motion = method.state, method.forces, method.motion
+        forces, motion = method.forces, method.motion
         reactions, update = motion[:-1], motion[-1:]
         seconds = self.term_seconds = dict.fromkeys((name for name, _ in (*forces, *motion)), 0.0)
 
         def take(terms: tuple[Term, ...]) -> None:
+            state = method.state
             for name, term in terms:
                 begin = clock()
                 term(state)
                 seconds[name] += clock() - begin
 
         step, last = (*update, *forces, *reactions), False
+        saved: deque[Any] = deque(maxlen=2)  # to go back to the older of them; the younger may be ill already
         take((*forces, *reactions))
-        while True:
-            with everywhere():
-                self._watch()
-            due, last = method.decide(self.figures)
+        for look in count():
+            try:
+                with everywhere():
+                    self._look()
+            except UnstableError:
+                if not saved or self.recoveries == RECOVERIES:
+                    self._write_last_good(writer)
+                    raise
+                self.recoveries += 1
+                method.recall(saved[0])
+                method.harden()
+                continue
+            due, last = method.decide(self.watch.figures)
             if due and writer is not None:
                 with self.phases("output"):
-                    self._write(writer)
+                    self._write(writer, method.frame_time)
             if last:
                 return
+            if self.deck.solver.on_inversion == "recover" and (due or look % SAVED == 0):
+                if due:
+                    saved.clear()  # what is written stays
+                saved.append(method.remember())
             for _ in range(method.between):
                 take(step)
 
+    def _look(self) -> None:
+        method = self.method
+        self.watch.look(method, self.interrupted)
+        if self.progress:
+            self.progress.show(method.progress, method.state.step, self.watch.figures)
+        if self.watch.interrupted:
+            share = method.state.share
+            raise InterruptedRun(f"interrupted at {share:.1%} of the load; what was written is readable")
+        self.good[:] = method.state.u[:, : self.sub.n_nodes]
+        self.good_time, self.good_figures = method.frame_time, self.watch.figures
+
+    def _write_last_good(self, writer: store.ResultWriter | None) -> None:
+        """As one more frame of a run that cannot go on, unless it is there already."""
+        if writer is None or self.good_time <= self.written:
+            return
+        self.method.state.place(self.good)
+        self.method.survey.look(self.method.state, self.method.safety)
+        self.watch.figures = self.good_figures
+        self._write(writer, self.good_time)
+
+    def _end_if_stalled(self, relaxation: Relaxation) -> None:
+        if relaxation.stalled:
+            raise UnstableError(
+                f"the relaxation comes no nearer to the static solution than {1e3 * relaxation.best:.2g} mm, by its "
+                f"own estimate; give solver.tolerance = {1.5e3 * relaxation.best:.2g} or more"
+                + (", or solver.precision = double" if self.deck.solver.precision == "single" else "")
+            )
+
     def _distance_to_static(self) -> float:
         """How far (m, the largest of all nodes) a ramp's end is from the static solution: found by going there."""
-        figures, seconds, end = self.figures, self.term_seconds, self.method.state
+        ramp, watch, seconds = self.method, self.watch, self.term_seconds
         self.method = relaxation = self._relaxation()
-        relaxation.start_from(end, self.own_energy)
+        self.watch = Watch(self.world, self.sub, self.volume)
+        relaxation.start_from(ramp.state, watch.own_energy)
+        relaxation.begin()
         moved = math.nan
         try:
             self._advance(None)
             n = self.sub.n_nodes
-            own = np.abs(relaxation.state.u[:, :n] - end.u[:, :n]).max()
-            moved = float(self.world.gather([own]).max()) + relaxation.distance
+            own = np.abs(relaxation.state.u[:, :n] - ramp.state.u[:, :n]).max()
+            moved = float(self.world.gather([own]).max()) + min(relaxation.distance, relaxation.best)
         except UnstableError:
             pass  # the run itself is well; only the estimate is not to be had
-        self.figures, self.term_seconds = figures, seconds
+        self.method, self.watch, self.term_seconds = ramp, watch, seconds
         return moved
 
     def warm_up(self) -> None:
@@ -280,67 +342,8 @@ class _Run:
 
     # ------------------------------------------------------------ what is watched
 
-    def _watch(self) -> None:
-        """Survey all ranks, keep the ledger, and end the run on all of them alike if it cannot go on."""
-        state, world = self.method.state, self.world
-        own = self.method.look()
-        self.own_energy = own["strain"] + own["hourglass"] + own["stabilisation"]
-        table = world.gather([*own.values(), float(self.interrupted)])
-        columns = dict(zip(own, table.T, strict=False))
-        figures = {name: float(_EXTREMES.get(name, sum)(columns[name])) for name in own}
-        internal = figures["strain"] + figures["hourglass"] + figures["stabilisation"]
-        supplied = figures["external"] + figures["added"] - figures["dissipated"]
-        self.largest_energy = max(self.largest_energy, abs(figures["external"]), internal, figures["kinetic"])
-        figures["balance_error"] = abs(supplied - internal - figures["kinetic"]) / (self.largest_energy or 1.0)
-        figures["kinetic_ratio"] = figures["kinetic"] / internal if internal > 0 else 0.0
-        if state.share >= 0.1:
-            self.largest_kinetic_ratio = max(self.largest_kinetic_ratio, figures["kinetic_ratio"])
-        self.figures = figures
-        if self.progress:
-            self.progress.show(self.method.progress, state.step, figures)
-        finite = math.isfinite(internal + figures["kinetic"] + figures["external"])
-        balance = figures["balance_error"] * self.largest_energy
-        if not finite or figures["min_jacobian"] <= 0:
-            reason = "a cell is turned inside out"
-        elif balance > BALANCE_LIMIT * self.largest_energy + self.noise and state.step >= LEDGER_STARTS:
-            reason = (
-                f"the energy balance is wrong by {figures['balance_error']:.1%} (supplied {supplied:.3g} J, internal "
-                f"{internal:.3g} J, kinetic {figures['kinetic']:.3g} J)"
-            )
-        else:
-            reason = ""
-        if reason:
-            worst = int(np.argmin(np.where(np.isnan(columns["min_jacobian"]), -np.inf, columns["min_jacobian"])))
-            cell = world.broadcast(self._worst_cell() if world.rank == worst else None, worst)
-            raise UnstableError(
-                f"unstable at {state.share:.1%} of the load: {reason}; {cell}; the step is "
-                f"{figures['step_ratio']:.2f} of the longest proved stable; load more slowly (solver.load_time, "
-                "solver.load_steps), refine the mesh or the cloud there, or enlarge cloud.radius"
-            )
-        if table[:, -1].any():
-            raise InterruptedRun(f"interrupted at {state.share:.1%} of the load; what was written is readable")
-
-    def _worst_cell(self) -> str:
-        """What and where the cell with the smallest J on this rank is, in a few words."""
-        rows, jacobian = self.sub.rows, self.method.survey.jacobian[:-1]
-        cell = int(np.argmin(np.where(np.isnan(jacobian), -np.inf, jacobian)))
-        n_hexahedra = len(rows.hexahedra)
-        hexahedron = cell < n_hexahedra
-        nodes = rows.hexahedra[cell] if hexahedron else rows.domains[cell - n_hexahedra]
-        local = np.searchsorted(rows.nodes, nodes)
-        x, y, z = 1e3 * (rows.points[local].mean(axis=0) if hexahedron else rows.domain_points[cell - n_hexahedra])
-        edges = rows.points[local] - rows.points[local].mean(axis=0)
-        stretched = edges + self.method.state.u[:, local].T - self.method.state.u[:, local].T.mean(axis=0)
-        stretch = np.linalg.norm(stretched, axis=1).max() / np.linalg.norm(edges, axis=1).max()
-        return (
-            f"worst is {'hexahedron' if hexahedron else 'support domain'} {rows.cells[cell]} "
-            f"({rows.materials[rows.material[cell]].name}) at ({x:.1f}, {y:.1f}, {z:.1f}) mm on rank {self.world.rank} "
-            f"with J = {jacobian[cell]:.3g} now, {self.method.state.smallest_jacobian:.3g} at its worst, and a stretch "
-            f"of {stretch:.3g}"
-        )
-
     def _interrupt(self, signum: int, frame: object) -> None:
-        self.interrupted = 1
+        self.interrupted = True
 
     # ------------------------------------------------------------ what is written
 
@@ -360,15 +363,16 @@ class _Run:
             },
         }
 
-    def _write(self, writer: store.ResultWriter) -> None:
+    def _write(self, writer: store.ResultWriter, frame_time: float) -> None:
         rows, u = self.sub.rows, self.method.state.u[:, : self.sub.n_nodes]
         domains = np.searchsorted(rows.nodes, rows.domains)
         at_points = np.einsum("ga,cga->gc", rows.domain_shapes, u[:, domains])
         displacement = np.concatenate([u.T[rows.owned], at_points])
         field = np.concatenate([self._field(u, domains)[rows.owned], at_points])
-        series = {name: self.figures[name] for name in _SERIES}
+        series = {name: self.watch.figures[name] for name in _SERIES}
+        self.written = frame_time
         writer.write_frame(
-            self.method.frame_time,
+            frame_time,
             {"displacement": displacement, "field_displacement": field},
             {"J": self.method.survey.jacobian[:-1]},
             series,
@@ -405,11 +409,12 @@ class _Run:
         )
         hexahedra, domains, halo_share, computed, peak = table.T
         cells = hexahedra.sum() + domains.sum()
-        figures = self.figures or dict.fromkeys(_SERIES, float("nan"))
+        figures = self.watch.figures or dict.fromkeys(_SERIES, float("nan"))
         return {
             "ranks": world.size,
             "steps": state.step,
             "time_step_s": state.time_step,
+            "recoveries": self.recoveries,
             "seconds": dict(self.phases.seconds) | {"loop": loop_seconds},
             "term_seconds": self.term_seconds,
             "cells": {"hexahedra": int(hexahedra.sum()), "support_domains": int(domains.sum())},
@@ -432,7 +437,7 @@ class _Run:
                 "balance_error": figures["balance_error"],
             },
             "kinetic_to_internal": {
-                "largest_after_10_percent": self.largest_kinetic_ratio,
+                "largest_after_10_percent": self.watch.largest_kinetic_ratio,
                 "at_end": figures["kinetic_ratio"],
             },
         }

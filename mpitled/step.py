@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,8 @@ class State:
 
     u: NDArray[np.float64]  # (3, n_nodes + PADDING), m, at the time of `step`
     u_prev: NDArray[np.float64]  # (3, n_nodes + PADDING), m, one step before
-    f: NDArray[np.float64]  # (3, n_nodes + PADDING), N, internal forces
+    seen: NDArray[np.floating]  # u as the cells read it: u itself, or its copy in single precision
+    f: NDArray[np.floating]  # (3, n_nodes + PADDING), N, internal forces, in the precision of `seen`
     mass: NDArray[np.float64]  # (n_nodes,), kg, as scaled; in relaxation (6, n_nodes), its symmetric tensor
     mobility: NDArray[np.float64]  # as mass, s^2/kg: dt^2 times its inverse
     reaction: NDArray[np.float64]  # (n owned moving dofs,), N
@@ -33,6 +35,11 @@ class State:
     smallest_jacobian: float = 1.0  # of all steps so far
     external_work: float = 0.0  # J, of the moving dofs that this rank owns
     free_work: float = 0.0  # J, of the internal forces at free dofs that this rank owns; counted in relaxation
+
+    def place(self, u: NDArray[np.float64]) -> None:
+        """Put the nodes at the displacements u (3, n_nodes), at rest."""
+        self.u[:, : u.shape[1]] = self.u_prev[:, : u.shape[1]] = u
+        self.seen[:] = self.u
 
     @property
     def share(self) -> float:
@@ -50,10 +57,12 @@ Term = tuple[str, Callable[[State], None]]
 
 def at_rest(sub: Subdomain, load_time: float, time_step: float) -> State:
     """The undeformed state, with the model's masses."""
-    u, u_prev, f = (np.zeros((3, sub.n_nodes + kernels.PADDING)) for _ in range(3))
+    u, u_prev = (np.zeros((3, sub.n_nodes + kernels.PADDING)) for _ in range(2))
+    seen = u if sub.precision == u.dtype else u.astype(sub.precision)
+    f = np.zeros_like(seen)
     mass = sub.rows.mass.copy()
     owned_moving = int(np.count_nonzero(sub.rows.owned[sub.moving // 3]))
-    return State(u, u_prev, f, mass, time_step**2 / mass, np.zeros(owned_moving), load_time, time_step)
+    return State(u, u_prev, seen, f, mass, time_step**2 / mass, np.zeros(owned_moving), load_time, time_step)
 
 
 def compose_forces(sub: Subdomain, halo: Halo | None) -> tuple[Term, ...]:
@@ -63,14 +72,14 @@ def compose_forces(sub: Subdomain, halo: Halo | None) -> tuple[Term, ...]:
     if runs is not None:
 
         def voxels(s: State) -> None:
-            J = kernels.voxel_forces(s.u, s.f, runs.start, runs.length, runs.scale, runs.coefficient)
+            J = kernels.voxel_forces(s.seen, s.f, runs.start, runs.length, runs.scale, runs.coefficient)
             s.smallest_jacobian = min(s.smallest_jacobian, J)
 
         terms.append(("voxel hexahedra", voxels))
     if hexahedra is not None:
 
         def general(s: State) -> None:
-            J = kernels.hexahedron_forces(s.u, s.f, hexahedra.nodes, hexahedra.geometry, hexahedra.coefficient)
+            J = kernels.hexahedron_forces(s.seen, s.f, hexahedra.nodes, hexahedra.geometry, hexahedra.coefficient)
             s.smallest_jacobian = min(s.smallest_jacobian, J)
 
         terms.append(("hexahedra", general))
@@ -78,7 +87,7 @@ def compose_forces(sub: Subdomain, halo: Halo | None) -> tuple[Term, ...]:
 
         def support_domains(s: State) -> None:
             J = kernels.domain_forces(
-                s.u, s.f, domains.nodes, domains.gradient, domains.position, domains.inverse, domains.coefficient,
+                s.seen, s.f, domains.nodes, domains.gradient, domains.position, domains.inverse, domains.coefficient,
             )  # fmt: skip
             s.smallest_jacobian = min(s.smallest_jacobian, J)
 
@@ -117,7 +126,7 @@ def _compose_motion(sub: Subdomain) -> _Motion:
 
 def compose_march(sub: Subdomain) -> tuple[Term, ...]:
     """The terms that move the nodes by their masses: the reactions where any dof moves, then the central difference."""
-    m = _compose_motion(sub)
+    m, (copied, advance) = _compose_motion(sub), _compose_copy(sub)
 
     def reactions(s: State) -> None:
         s.external_work += kernels.react(
@@ -125,15 +134,15 @@ def compose_march(sub: Subdomain) -> tuple[Term, ...]:
         )
 
     def update(s: State) -> None:
-        kernels.update(s.u, s.u_prev, s.f, s.mobility, sub.fixed, sub.moving, m.full, m.share(s))
-        _advance(s)
+        kernels.update(s.u, s.u_prev, s.f, s.mobility, sub.fixed, sub.moving, m.full, m.share(s), copied(s))
+        advance(s)
 
     return (*m.terms, *((("reactions", reactions),) if len(m.dofs) else ()), ("update", update))
 
 
 def compose_relaxation(sub: Subdomain, counted: NDArray[np.float64]) -> tuple[Term, ...]:
     """As `compose_march`, damped, and with a mass tensor at each node; counted (3, n_nodes): see `kernels.relax`."""
-    m = _compose_motion(sub)
+    m, (copied, advance) = _compose_motion(sub), _compose_copy(sub)
 
     def reactions(s: State) -> None:
         s.external_work += kernels.react(
@@ -142,9 +151,10 @@ def compose_relaxation(sub: Subdomain, counted: NDArray[np.float64]) -> tuple[Te
 
     def relax(s: State) -> None:
         s.free_work += kernels.relax(
-            s.u, s.u_prev, s.f, s.mobility, counted, sub.fixed, sub.moving, m.full, m.share(s), s.retain, s.gain
-        )
-        _advance(s)
+            s.u, s.u_prev, s.f, s.mobility, counted, sub.fixed, sub.moving, m.full, m.share(s), s.retain, s.gain,
+            copied(s),
+        )  # fmt: skip
+        advance(s)
 
     return (*m.terms, *((("reactions", reactions),) if len(m.dofs) else ()), ("update", relax))
 
@@ -156,7 +166,18 @@ def rehearse(s: State, terms: tuple[Term, ...]) -> None:
             term(s)
 
 
-def _advance(s: State) -> None:
-    s.u, s.u_prev = s.u_prev, s.u
-    s.time += s.time_step
-    s.step += 1
+def _compose_copy(sub: Subdomain) -> tuple[Callable[[State], Any], Callable[[State], None]]:
+    """What an update fills with the new displacements for the cells to read, and what ends the step."""
+
+    def swap(s: State) -> None:
+        s.u, s.u_prev = s.u_prev, s.u
+        s.time += s.time_step
+        s.step += 1
+
+    def swap_and_see(s: State) -> None:
+        swap(s)
+        s.seen = s.u
+
+    if sub.precision == np.float64:
+        return (lambda s: None), swap_and_see
+    return (lambda s: s.seen), swap

@@ -145,26 +145,41 @@ def read_remarks(path: Path) -> list[str]:
         return list(_read_json(file, "remarks"))
 
 
-def describe_model(path: Path) -> str:
-    """Sizes, sets, materials and figures of a model, a line each."""
+def model_contents(path: Path) -> dict[str, Any]:
+    """Sizes, sets, materials and figures of a model, as JSON can hold them."""
     with _open_model(path) as file:
-        lines = [
-            f"nodes            {len(file['points'])} ({file.attrs['n_fe_nodes']} FE)",
-            f"hexahedra        {len(file['hexahedra'])}",
-            f"support domains  {len(file['domains'])} of {file['domains'].shape[1]} nodes",
-            f"prescribed dofs  {len(file['prescribed_dofs'])}",
-        ]
-        lines += [
-            f"material         {m.name}: E {m.youngs_modulus:g} Pa, nu {m.poissons_ratio:g}, {m.density:g} kg/m3"
-            for m in _read_materials(file)
-        ]
-        for kind in ("node_sets", "cell_sets"):
-            lines += [
-                f"{kind[:-1].replace('_', ' '):16} {name}: {len(v)}" for name, v in _read_sets(file[kind]).items()
-            ]
-        lines += [f"{name}: {value:.6g}" for name, value in _read_json(file, "figures").items()]
-        lines += list(_read_json(file, "remarks"))
-    return "\n".join(lines)
+        return {
+            "nodes": len(file["points"]),
+            "fe_nodes": int(file.attrs["n_fe_nodes"]),
+            "hexahedra": len(file["hexahedra"]),
+            "support_domains": len(file["domains"]),
+            "domain_nodes": file["domains"].shape[1],
+            "prescribed_dofs": len(file["prescribed_dofs"]),
+            "materials": _read_json(file, "materials"),
+            "node_sets": {name: len(members) for name, members in _read_sets(file["node_sets"]).items()},
+            "cell_sets": {name: len(members) for name, members in _read_sets(file["cell_sets"]).items()},
+            "figures": _read_json(file, "figures"),
+            "remarks": _read_json(file, "remarks"),
+        }
+
+
+def describe_model(path: Path) -> str:
+    """The contents of a model, a line each."""
+    has = model_contents(path)
+    lines = [
+        f"nodes            {has['nodes']} ({has['fe_nodes']} FE)",
+        f"hexahedra        {has['hexahedra']}",
+        f"support domains  {has['support_domains']} of {has['domain_nodes']} nodes",
+        f"prescribed dofs  {has['prescribed_dofs']}",
+    ]
+    lines += [
+        f"material         {m.name}: E {m.youngs_modulus:g} Pa, nu {m.poissons_ratio:g}, {m.density:g} kg/m3"
+        for m in (Material(**values) for values in has["materials"])
+    ]
+    for kind in ("node_sets", "cell_sets"):
+        lines += [f"{kind[:-1].replace('_', ' '):16} {name}: {n}" for name, n in has[kind].items()]
+    lines += [f"{name}: {value:.6g}" for name, value in has["figures"].items()]
+    return "\n".join([*lines, *has["remarks"]])
 
 
 def read_grid(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -185,6 +200,17 @@ def read_grid(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         except OSError as error:
             raise InputError(f"{path}: cannot be read as HDF5 ({str(error).splitlines()[0]})") from None
     return np.stack(columns[:3], axis=1), columns[3]
+
+
+def write_columns(path: Path, groups: Mapping[str, Mapping[str, Sequence[float | str]]]) -> None:
+    """Columns of tables, a group for each table, at once or not at all: numbers, or where there are others, text."""
+    with _replacing(path) as temporary, h5py.File(temporary, "w", locking=False) as file:
+        for name, columns in groups.items():
+            group = file.create_group(name, track_order=True)
+            for column, values in columns.items():
+                text = any(isinstance(value, str) for value in values)
+                data: Any = [str(value) for value in values] if text else np.asarray(values, np.float64)
+                group.create_dataset(column, data=data, dtype=h5py.string_dtype() if text else None)
 
 
 @contextmanager

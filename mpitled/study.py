@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import csv
-import hashlib
+import io
 import json
-import os
-import re
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mpitled import compare, launch
+from mpitled import atomic, compare, launch
+from mpitled import vary as families
 from mpitled.deck import load_deck
 from mpitled.errors import InputError
 
@@ -35,35 +34,19 @@ class Variant:
     @property
     def folder(self) -> str:
         """A name that no other variant has, and that a person can read."""
-        text = json.dumps([self.overrides, self.ranks])
-        readable = "".join(c if c.isalnum() or c in "._-" else "-" for c in f"{self.family}-{self.value}")
-        return f"{readable[:60]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+        return families.folder(f"{self.family}-{self.value}", json.dumps([self.overrides, self.ranks]))
 
 
 def variants(vary: Sequence[str], base: Sequence[str]) -> Iterator[Variant]:
-    """The scene as it is, then each "key=a,b,c" in turn, one key at a time; the key "ranks" is the number of ranks.
-
-    A list is a value: "block.elements=[4,4,4],[8,8,8]". Keys that go together are joined by "+": "a=1,2+b=3,4" is
-    a = 1, b = 3, then a = 2, b = 4.
-    """
+    """The scene as it is, then each family in turn (see `vary.family`); the key "ranks" is the number of ranks."""
     yield Variant("as it is", "", tuple(base), 1)
     for text in vary:
-        keys, columns = [], []
-        for part in text.split("+"):
-            key, equals, values = part.partition("=")
-            if not equals or not key.strip() or not values.strip():
-                raise InputError(f"--vary {text}: is not key=value,value,...; write for example cloud.growth=0.15,0.2")
-            keys.append(key.strip())
-            columns.append([value.strip() for value in re.split(r",(?![^\[]*\])", values)])
-        if len({len(column) for column in columns}) > 1:
-            raise InputError(f"--vary {text}: keys that go together need as many values each")
-        for chosen in zip(*columns, strict=True):
-            given = dict(zip(keys, chosen, strict=True))
-            ranks = given.pop("ranks", "1")
+        for values in families.family(text):
+            ranks = values.get("ranks", "1")
             if not ranks.isdecimal() or int(ranks) < 1:
                 raise InputError(f"--vary {text}: ranks = {ranks}: is not a number of ranks; give 1 or more")
-            overrides = (*base, *(f"{key}={value}" for key, value in given.items()))
-            yield Variant("+".join(keys), " ".join(chosen), overrides, int(ranks))
+            keys = {key: value for key, value in values.items() if key != "ranks"}
+            yield Variant("+".join(values), " ".join(values.values()), families.overrides(base, keys), int(ranks))
 
 
 def study(
@@ -87,7 +70,7 @@ def study(
         rows.append(_row(variant, failure, folder, reference, beyond))
     for row in rows:
         row["pareto"] = _is_best(row, rows)
-    _write_table(out / "study.csv", rows)
+    atomic.write_text(out / "study.csv", _csv(rows))
     try:
         from mpitled import charts
     except ImportError:
@@ -134,13 +117,12 @@ def _is_best(row: dict[str, Any], rows: list[dict[str, Any]]) -> bool:
     )
 
 
-def _write_table(path: Path, rows: list[dict[str, Any]]) -> None:
-    temporary = path.with_name(f".{path.name}")
-    with temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        writer.writerows(rows)
-    os.replace(temporary, path)
+def _csv(rows: list[dict[str, Any]]) -> str:
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, COLUMNS)
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
 
 
 def table(rows: list[dict[str, Any]]) -> str:

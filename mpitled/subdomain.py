@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mpitled import hexahedra, support
 from mpitled.kernels import BATCH_LANES, VOXEL_LANES
+from mpitled.material import stabilising_modulus
 from mpitled.mesh import CORNERS
 from mpitled.store import PartRows
 
@@ -75,13 +77,23 @@ class Subdomain:
     moving_full: NDArray[np.float64]  # (len(moving),), m at full load
     moving_turns: NDArray[np.float64] | None  # (len(moving), 3), see `loading.turn`; None where all move straight
     shared: tuple[tuple[int, NDArray[np.uint32]], ...]  # (rank, nodes shared with it), ranks ascending
+    precision: type[np.floating]  # of the cells' arithmetic
 
     @property
     def n_owned(self) -> int:
         return int(np.count_nonzero(self.rows.owned))
 
+    def free(self) -> NDArray[np.float64]:
+        """(3, n_nodes): 1 at free dofs, 0 at prescribed ones."""
+        free = np.ones((3, self.n_nodes))
+        for held in (self.fixed, self.moving):
+            free[held % 3, held // 3] = 0
+        return free
 
-def localise(rows: PartRows, hourglass: float, stabilisation: float, rule: str) -> Subdomain:
+
+def localise(
+    rows: PartRows, hourglass: float, stabilisation: float, rule: str, precision: type[np.floating] = np.float64
+) -> Subdomain:
     """Local numbers and packed cells of a part.
 
     hourglass is R_hg of eq. 4.22, stabilisation the share s of design (0: the paper's own support domains), rule the
@@ -108,9 +120,11 @@ def localise(rows: PartRows, hourglass: float, stabilisation: float, rule: str) 
         rows=rows,
         n_nodes=len(rows.nodes),
         n_cells=len(rows.cells),
-        runs=_voxel_runs(cells, edges, lame[:, :n_hexahedra], breaks, in_runs, hourglass),
-        hexahedra=_hexahedron_batches(rows.points, cells, general, lame, len(rows.cells), hourglass, rule),
-        domains=_domain_batches(rows, local(rows.domains), lame[:, n_hexahedra:], stabilisation),
+        runs=_in(precision, _voxel_runs(cells, edges, lame[:, :n_hexahedra], breaks, in_runs, hourglass)),
+        hexahedra=_in(
+            precision, _hexahedron_batches(rows.points, cells, general, lame, len(rows.cells), hourglass, rule)
+        ),
+        domains=_in(precision, _domain_batches(rows, local(rows.domains), lame[:, n_hexahedra:], stabilisation)),
         fixed=dofs[~moves],
         moving=dofs[moves],
         moving_full=rows.prescribed_displacements[moves],
@@ -121,7 +135,19 @@ def localise(rows: PartRows, hourglass: float, stabilisation: float, rule: str) 
                 rows.neighbours, rows.shared_offsets[:-1], rows.shared_offsets[1:], strict=True
             )
         ),
+        precision=precision,
     )
+
+
+def _in(precision: type[np.floating], cells: Any) -> Any:
+    """Packed cells, or None, with their numbers that are not indices in this precision."""
+    if cells is None:
+        return None
+    arrays = {f.name: getattr(cells, f.name) for f in fields(cells)}
+    real = {
+        name: a.astype(precision, copy=False) for name, a in arrays.items() if a is not None and a.dtype.kind == "f"
+    }
+    return replace(cells, **real)
 
 
 def _boxes(points: NDArray[np.float64], cells: NDArray[np.uint32]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
@@ -172,7 +198,9 @@ def _voxel_runs(
         length=np.diff(breaks)[in_runs[breaks[:-1]]].astype(np.uint64),
         first_cell=first.astype(np.uint64),
         scale=1 / (4 * edge),
-        coefficient=np.stack([mu * volume, lam * volume, hourglass * (lam + 2 * mu) * volume * gram.sum(axis=0) / 8]),
+        coefficient=np.stack(
+            [mu * volume, lam * volume, hourglass * stabilising_modulus(lam, mu) * volume * gram.sum(axis=0) / 8]
+        ),
         gram=gram,
     )
 
@@ -193,7 +221,7 @@ def _hexahedron_batches(
     gradients, _ = hexahedra.geometry(points, nodes, rule)
     gamma = hexahedra.hourglass_vectors(points, nodes, gradients)
     mu, lam = lame[:, chosen]
-    k = hexahedra.hourglass_stiffness(gradients, volumes, lam + 2 * mu, hourglass)
+    k = hexahedra.hourglass_stiffness(gradients, volumes, stabilising_modulus(lam, mu), hourglass)
     geometry = np.concatenate([gradient_modes.reshape(-1, 18) / 8, x_modes.reshape(-1, 12)], axis=1)
     return HexahedronBatches(
         nodes=_lanes(nodes),
@@ -213,7 +241,7 @@ def _domain_batches(
     position, inverse = support.linear_projector(rows.points[nodes])
     mu, lam = lame
     volume = rows.domain_volumes
-    kappa = support.stabilisation_stiffness(inverse, volume, lam + 2 * mu, stabilisation)
+    kappa = support.stabilisation_stiffness(inverse, volume, stabilising_modulus(lam, mu), stabilisation)
     gram = np.einsum("gai,gaj->gij", rows.domain_gradients, rows.domain_gradients)
     numbers = np.arange(len(rows.hexahedra), len(rows.cells), dtype=np.uint32)
     stabilised = stabilisation > 0

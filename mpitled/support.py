@@ -215,9 +215,10 @@ def repair(
                 break
         if best > worst:
             x, y, z = at[g] * 1e3
+            lower = ", or support.basis = 4" if basis > 4 else ""
             raise InputError(
                 f"support.basis = {basis}: the nodes around ({x:.2f}, {y:.2f}, {z:.2f}) mm lie in a plane or do not "
-                "span the basis; add nodes there, set support.nodes higher, or support.basis = 4"
+                f"span the basis; add nodes there, set support.nodes higher{lower}"
             )
         domains[g] = domain
     return len(bad)

@@ -40,17 +40,17 @@ class Survey:
         strain = hourglass = stabilisation = 0.0
         if (r := sub.runs) is not None:
             strain, hourglass = kernels.voxel_survey(
-                s.u, r.start, r.length, r.first_cell, r.scale, r.coefficient, r.gram, required, factor, jacobian
+                s.seen, r.start, r.length, r.first_cell, r.scale, r.coefficient, r.gram, required, factor, jacobian
             )
         if (h := sub.hexahedra) is not None:
             more, resisted = kernels.hexahedron_survey(
-                s.u, h.nodes, h.cells, h.geometry, h.coefficient, h.gram, h.stiffness, required, factor, jacobian
+                s.seen, h.nodes, h.cells, h.geometry, h.coefficient, h.gram, h.stiffness, required, factor, jacobian
             )
             strain += more
             hourglass += resisted
         if (d := sub.domains) is not None:
             more, stabilisation = kernels.domain_survey(
-                s.u, d.nodes, d.cells, d.gradient, d.position, d.inverse, d.coefficient, d.gram, d.stiffness,
+                s.seen, d.nodes, d.cells, d.gradient, d.position, d.inverse, d.coefficient, d.gram, d.stiffness,
                 required, factor, jacobian, tensor,
             )  # fmt: skip
             strain += more

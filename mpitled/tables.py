@@ -1,4 +1,4 @@
-"""Tables that come with the meshes of others: integration points (CSV or HDF5) and areas of the outer surface (CSV)."""
+"""Tables of others: integration points (CSV or HDF5), areas of the outer surface and displacements at places (CSV)."""
 
 from __future__ import annotations
 
@@ -49,6 +49,15 @@ def read_areas(path: Path, metre: float, ids: NDArray[np.int64]) -> NDArray[np.f
     areas = np.zeros((len(ids), 3))
     areas[at] = rows[:, 1:] * metre**2
     return areas
+
+
+def read_field(path: Path) -> tuple[NDArray[np.float64], int]:
+    """Places and displacements (n, 6), x, y, z, ux, uy, uz in the file's unit, and the line of the first."""
+    rows, first = _read_table(path, ("x", "y", "z", "ux", "uy", "uz"))
+    bad = np.flatnonzero(~(np.abs(rows) < meshfile.FARTHEST).all(axis=1))
+    if len(bad):
+        raise InputError(f"{path}: line {first + bad[0]}: a number is beyond {meshfile.FARTHEST:g} ({len(bad)} such)")
+    return rows, first
 
 
 def _read_table(path: Path, names: tuple[str, ...]) -> tuple[NDArray[np.float64], int]:

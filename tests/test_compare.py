@@ -233,6 +233,8 @@ SCENES = [
     ("cylinder", "A_ext", 5, ["cylinder.element_size=8"]),
     ("cylinder", "A_shear", 5, ["cylinder.element_size=8", "displaced.0.displacement=[20,0,0]"]),
     ("indentation", "B_ind", 10, ["ellipsoid.element_size=8"]),
+    ("bump", "B_bump", 0, ["ellipsoid.element_size=8"]),
+    ("inclusion", "E2_inc", 0, ["block.elements=[4,4,4]"]),
     ("tumour", "C_tum", 0, ["ellipsoid.element_size=8"]),
     ("torsion", "E4_torsion", 5, ["block.elements=[4,4,16]"]),
     ("cube", "E3_cube_stress_50", 0, ["block.elements=[4,4,4]"]),

@@ -313,7 +313,9 @@ def test_energy_is_kept_by_the_central_difference():
             for _, term in terms[:-1]:
                 term(state)
             figures = survey.look(state, 1.0)
-            kinetic = kernels.kinetic_energy(state.u, state.u_prev, state.f, state.mass, owned, none, time_step)
+            kinetic = kernels.kinetic_energy(
+                state.u, state.u_prev, state.f, state.mass, state.mobility, owned, none, time_step
+            )
             energies.append(figures["strain"] + figures["hourglass"] + kinetic)
             terms[-1][1](state)
         energies = np.array(energies)

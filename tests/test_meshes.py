@@ -276,6 +276,14 @@ def test_remarks_on_what_can_be_computed_and_should_not(tmp_path, old, new, word
         assert "rigid" in said  # right is moved along x only
 
 
+def test_an_element_given_twice_is_an_error(tmp_path):
+    """It would be twice as stiff and twice as heavy, and nothing else would tell."""
+    path = tmp_path / "deck.inp"
+    path.write_text(FLAT.replace("*NSET, NSET=left", "9, 25, 15, 10, 20, 125, 115, 110, 120\n*NSET, NSET=left", 1))
+    with pytest.raises(InputError, match=r"line 17: element 9 has the same nodes as element 7.*take one .* out"):
+        meshes.read_mesh(MeshFiles(fe=path))
+
+
 def test_a_node_fixed_and_displaced_at_once_is_an_error(tmp_path):
     (tmp_path / "deck.inp").write_text(FLAT.replace(" left, 1, 3\n", " left, 1, 3\n left, 1, 1, 0.1\n"))
     with pytest.raises(InputError, match=r"node 10 is moved by 100 mm in x, and by 0 mm .*\(4 such\)"):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from conftest import ROOT
 
-from mpitled import deck, hexahedra, kernels, loading, preprocess, support
+from mpitled import deck, hexahedra, kernels, loading, onion, preprocess, support
+from mpitled.block import block_mesh
 from mpitled.cloud import boundary_faces
 from mpitled.errors import InputError
 from mpitled.mesh import Rotation
@@ -99,10 +102,76 @@ def test_no_corner_is_poor(size):
 @pytest.mark.parametrize("size", [0.008, 0.005, 0.003])
 def test_elements_have_the_size_asked_for(size):
     """In the mean within 10 %; edges of the smallest and the largest cell differ by less than a factor of 2."""
-    for mesh in (cylinder(size), ellipsoid(size)):
+    for mesh in (cylinder(size, grading=1.0), ellipsoid(size)):
         edges = np.cbrt(hexahedra.volumes(mesh.points, mesh.hexahedra))
         assert np.cbrt((edges**3).mean()) == pytest.approx(size, rel=0.1)
         assert edges.max() < 2 * edges.min()
+
+
+def test_graded_elements_are_thin_where_surfaces_change():
+    """As many as without grading; volume, sets and their edges stay; the thinnest layer has the share asked for."""
+    ball = 4 / 3 * np.pi * AXES.prod()
+    for mesher, name, exact in ((cylinder, "bottom", np.pi * RADIUS**2 * HEIGHT), (ellipsoid, "patch", ball)):
+        even, fine = mesher(0.005, grading=1.0), mesher(0.005, grading=0.25)
+        assert len(fine.hexahedra) == len(even.hexahedra)
+        np.testing.assert_array_equal(fine.node_sets[name], even.node_sets[name])
+        reach = [np.abs(mesh.points[mesh.node_sets[name]]).max(axis=0) for mesh in (even, fine)]
+        np.testing.assert_allclose(reach[0], reach[1], atol=ROUND_OFF)
+        missing = [1 - fe_volume(mesh) / exact for mesh in (even, fine)]  # wider facets, larger sagittae
+        assert 0 < missing[0] < missing[1] < 2 * missing[0]
+        assert hexahedra.scaled_jacobian(fine.points, fine.hexahedra).min() > 0.4
+    layers = np.diff(np.unique(cylinder(0.005, grading=0.25).points[:, 2])) / 0.005
+    assert layers[0] == pytest.approx(layers[-1]) == layers.min()
+    # The map's slope at its end is the share; half a layer inwards it is more by the second order.
+    for n in (20, 40):
+        thinnest = n * (1 - onion.graded(n, 0.25)[-2])
+        assert thinnest - 0.25 == pytest.approx(0.75 * np.pi**2 / 6 / n**2, rel=0.01)
+
+
+@pytest.mark.parametrize("where", ["corner", "middle", "face"])
+def test_block_is_fitted_to_a_sphere(where):
+    """Its hull converges to the ball at second order, the faces stay whole, and cells are sound on both sides."""
+    centre = {"corner": (0.0, 0.0, 0.0), "middle": (0.015, 0.014, 0.016), "face": (0.015, 0.015, 0.03)}[where]
+    ball = 4 / 3 * np.pi * 0.008**3 / {"corner": 8, "middle": 1, "face": 2}[where]
+    sphere = deck.Sphere(name="cyst", centre=centre, radius=0.008)
+    errors = []
+    for n in (4, 8):
+        block = deck.Block(size=(0.03, 0.03, 0.03), elements=(n, n, n), fitted="cyst")
+        mesh = block_mesh(block, CLOUD, None, [sphere])
+        assert fe_volume(mesh) == pytest.approx(0.03**3, rel=1e-12)
+        assert hexahedra.scaled_jacobian(mesh.points, mesh.hexahedra).min() > 0.3
+        inside = np.linalg.norm(mesh.points[mesh.hexahedra].mean(axis=1) - centre, axis=1) < sphere.radius
+        errors.append(1 - hexahedra.volumes(mesh.points, mesh.hexahedra[inside]).sum() / ball)
+        np.testing.assert_array_equal(mesh.node_sets["surface"], np.unique(boundary_faces(mesh.hexahedra)))
+    assert 0 < errors[1] < errors[0] < 0.1
+    assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
+    with pytest.raises(InputError, match=r"block.fitted: the sphere cyst .* does not lie in the block"):
+        block_mesh(block, CLOUD, None, [dataclasses.replace(sphere, radius=0.04)])
+
+
+def test_sphere_of_cells(tmp_path):
+    """Hexahedra and integration points by their middles; what cannot be is said by its key."""
+    path = tmp_path / "scene.toml"
+    text = '[block]\nsize = [40, 40, 40]\nelements = [8, 8, 8]\ncloud = "core"\n[[fixed]]\nnodes = "x0"\n' + MATERIAL
+    cyst = "[sphere.cyst]\ncentre = [12, 20, 20]\nradius = 10\n"
+    cyst += '[material.fluid]\nyoungs_modulus = 10\npoissons_ratio = 0.1\ncells = ["cyst"]\n'
+    path.write_text(text + cyst)
+    mesh, model = (of(deck.load_deck(path)) for of in (preprocess.read_mesh, preprocess.build))
+    middles = np.concatenate([mesh.points[mesh.hexahedra].mean(axis=1), mesh.integration_points])
+    inside = np.linalg.norm(middles - [0.012, 0.02, 0.02], axis=1) <= 0.01
+    assert 0 < inside[: len(mesh.hexahedra)].sum() < inside.sum() < len(middles)
+    np.testing.assert_array_equal(np.flatnonzero(inside), mesh.cell_sets["cyst"])
+    np.testing.assert_array_equal([model.materials[m].name for m in model.material], np.where(inside, "fluid", "brain"))
+    for before, after, message in (
+        ("radius = 10", "radius = 0.1", r"sphere.cyst: no cell has its middle in it"),
+        ("sphere.cyst", "sphere.all", r"sphere.all: there is a cell set of that name"),
+    ):
+        path.write_text(text + cyst.replace(before, after))
+        with pytest.raises(InputError, match=message):
+            preprocess.read_mesh(deck.load_deck(path))
+    path.write_text(text + cyst)
+    with pytest.raises(InputError, match=r"block.fitted = .*is none of the spheres \(cyst\)"):
+        deck.load_deck(path, ["block.fitted=cist"])
 
 
 @pytest.mark.parametrize("tumour", [None, TUMOUR], ids=["whole", "tumour"])
@@ -110,7 +179,7 @@ def test_elements_have_the_size_asked_for(size):
 def test_cloud_takes_the_place_of_hexahedra(cloud, tumour):
     for mesher in (cylinder, ellipsoid):
         seed = tumour and deck.Tumour(centre=(0.005, 0.0, 0.05 if mesher is cylinder else 0.008), volume=523.6e-9)
-        whole, mesh = mesher(0.007), mesher(0.007, cloud=cloud, tumour=seed)
+        whole, mesh = mesher(0.007, grading=1.0), mesher(0.007, cloud=cloud, tumour=seed, grading=1.0)
         missing = SEED_VOLUME if seed else 0.0
         volume = mesh.integration_volumes.sum() + (fe_volume(mesh) if len(mesh.hexahedra) else 0.0)
         assert volume == pytest.approx(fe_volume(whole) - missing, rel=1e-12)
@@ -124,7 +193,7 @@ def test_cloud_takes_the_place_of_hexahedra(cloud, tumour):
 def test_core_ends_at_its_share_of_the_radius():
     """The square core alone at a share of 0.5; with more, also rings, but never the outermost."""
     for share, reach in ((0.5, 0.5), (0.7, 0.7), (0.999, 0.8)):
-        mesh = cylinder(0.005, cloud="core", core_share=share)
+        mesh = cylinder(0.005, cloud="core", core_share=share, grading=1.0)
         places = mesh.points[mesh.node_sets["interface"]]
         r = np.hypot(*places[:, :2].T).max() / RADIUS
         assert r == pytest.approx(reach, abs=0.13)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -182,6 +183,34 @@ def test_one_two_and_four_ranks_agree_and_repeat(tmp_path):
         assert other.tobytes() == values.tobytes()
 
 
+@pytest.mark.parametrize("method", ["quasi-static", "dynamic-relaxation"])
+def test_single_precision_of_the_cells_is_enough(tmp_path, method):
+    """On two ranks against double precision on one. u in single precision is known to 6e-8; across a cell of a tenth of
+    |u| that is a strain of 6e-7, by lambda / mu = 49 the shear strain of 3e-5 that balances its pressure, and over such
+    a cell 3e-6 of |u|. A few cells add up.
+    """
+    path = deck(tmp_path, GROWTH, volume=523.6)
+    fields = []
+    for n, precision in ((1, "double"), (2, "single")):
+        keys = (f"solver.method={method}", f"solver.precision={precision}", "solver.tolerance=1e-4")
+        mpitled("run", path, *(word for key in keys for word in ("--set", key)), "--out", tmp_path / precision, n=n)
+        fields.append(final(tmp_path / precision))
+    for single, double in zip(*reversed(fields), strict=True):
+        assert 0 < np.abs(single - double).max() < 3e-5 * np.abs(double).max()
+
+
+def test_a_tolerance_below_round_off_ends_with_what_can_be_reached(tmp_path):
+    path = deck(tmp_path, STRETCH, cloud="none", millimetres=6.0, load_time=0.1)
+    keys = ("solver.method=dynamic-relaxation", "solver.precision=single", "solver.tolerance=1e-9")
+    done = mpitled("run", path, *(w for key in keys for w in ("--set", key)), "--out", tmp_path / "out", status=3)
+    said = complaint(done)
+    assert "solver.tolerance" in said
+    reachable = float(said.split("solver.tolerance = ")[1].split()[0])
+    assert 1e-9 < reachable < 1e-2
+    keys = (*keys[:2], f"solver.tolerance={reachable}")
+    mpitled("run", path, *(w for key in keys for w in ("--set", key)), "--out", tmp_path / "out")
+
+
 def test_ranks_agree_to_round_off_in_the_linear_range(tmp_path):
     """A strain of 1/600: the round-off of I + grad u is 1e-13 of it, and some thousand steps add to that."""
     path = deck(tmp_path, STRETCH, cloud="core", millimetres=0.05, load_time=0.1)
@@ -269,6 +298,14 @@ def test_a_step_above_the_critical_one_is_refused_with_the_one_to_use(tmp_path, 
     mpitled(*run, f"solver.time_step={longest}", "--set", "solver.load_time=0.05", n=n)
 
 
+def test_a_density_in_the_wrong_unit_is_refused_for_the_steps_that_it_takes(tmp_path):
+    """t/mm3 in place of kg/m3: a million times as many steps."""
+    path = deck(tmp_path, STRETCH, cloud="none", millimetres=3.0, load_time=1.0)
+    line = complaint(mpitled("run", path, "--out", tmp_path / "out", "--set", "material.brain.density=1e-9", status=2))
+    assert "solver.load_time = 1: takes" in line
+    assert "units of densities" in line
+
+
 @pytest.mark.parametrize("n", [1, 2])
 def test_an_unstable_run_stops_and_says_why(tmp_path, n):
     """A block pressed through itself: no step and no mass can save it."""
@@ -278,7 +315,45 @@ def test_an_unstable_run_stops_and_says_why(tmp_path, n):
         assert word in line
     with open_result(tmp_path / "out") as result:
         assert not result.complete
-        assert result.n_frames >= 1
+        assert result.n_frames >= 2  # at rest, and the last good state
+        assert np.abs(result.at_nodes("displacement", -1)).max() > 1e-3
+        assert result.in_cells("J", -1).min() > 0
+
+
+@pytest.mark.parametrize(("method", "keys"), [
+    ("dynamic-relaxation", ("solver.load_steps=40",)),  # so fast that the seed runs into its neighbours
+    ("quasi-static", ("solver.safety=1.0", "solver.load_time=0.1")),  # at the very edge of stability
+])  # fmt: skip
+def test_an_unstable_run_recovers_on_request(tmp_path, method, keys):
+    """It ends where a slow, safe run ends, within what both say is left to the static solution."""
+    path = deck(tmp_path, GROWTH, volume=523.6)
+    words = [word for key in (f"solver.method={method}", *keys) for word in ("--set", key)]
+    mpitled("run", path, "--out", tmp_path / "stops", *words, status=3)
+    mpitled("run", path, "--out", tmp_path / "recovers", *words, "--set", "solver.on_inversion=recover")
+    report = json.loads((tmp_path / "recovers" / "report.json").read_text())
+    assert 1 <= report["recoveries"] <= 5
+    assert report["energy_J"]["balance_error"] < 0.05
+    mpitled("run", path, "--out", tmp_path / "safe", "--set", "solver.method=dynamic-relaxation")
+    within = 1e-3 * report["static_distance_mm"] + 1e-5
+    for found, safe in zip(final(tmp_path / "recovers"), final(tmp_path / "safe"), strict=True):
+        assert np.abs(found - safe).max() < within
+
+
+@pytest.mark.parametrize("way", ["step_too_long", "not_a_number", "inverted_cell"])
+def test_what_one_of_four_ranks_breaks_ends_all_of_them_at_once(tmp_path, way):
+    """One message, and every rank is out of the command within a second of the survey that finds it."""
+    path = deck(tmp_path, STRETCH, cloud="core", millimetres=6.0, load_time=0.5)
+    script = Path(__file__).with_name("parallel_broken.py")
+    command = [*ranks(4), sys.executable, script, path, tmp_path / "out", way]
+    done = subprocess.run(command, env=ENVIRONMENT, cwd=ROOT, timeout=120, capture_output=True, text=True)
+    assert done.returncode == 3
+    line = complaint(done)
+    for word in ("unstable at", "mm", "J = ", "rank", "brain"):
+        assert word in line
+    ends = [json.loads((tmp_path / "out" / f"rank_{rank}.json").read_text()) for rank in range(4)]
+    assert [end["status"] for end in ends] == [3] * 4
+    assert sum("broken" in end for end in ends) == 1
+    assert max(end["ended"] for end in ends) - min(end["detected"] for end in ends) < 1.0
 
 
 @pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])

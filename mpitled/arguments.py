@@ -1,0 +1,166 @@
+"""What the command line takes: every command with its arguments, without what carries them out."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from mpitled import __version__
+
+#: What `mpitled new` writes a deck for.
+KINDS = ("brain", "decks", "block", "cylinder", "ellipsoid")
+
+
+def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -> argparse.ArgumentParser:
+    """The parser; `options.command` is the function of the chosen command."""
+    made = argparse.ArgumentParser(
+        prog="mpitled",
+        description="Brain deformation by tumour growth: coupled FE/EFG and explicit dynamics on MPI ranks.",
+    )
+    made.add_argument("--version", action="version", version=f"mpitled {__version__}")
+    of_all = made.add_subparsers(required=True, metavar="COMMAND")
+
+    def command(name: str, words: str, *, json: bool = False) -> argparse.ArgumentParser:
+        added = of_all.add_parser(name, help=words)
+        added.set_defaults(command=commands[name], verbose=False, json=False)
+        if json:
+            added.add_argument("--json", action="store_true", help="JSON instead of a table")
+        return added
+
+    run = command("run", "compute a deck; on N ranks: mpirun -n N mpitled run DECK", json=True)
+    _deck(run)
+    run.add_argument("-v", "--verbose", action="store_true", help="also each phase as it begins, with its rank")
+    run.add_argument("-q", "--quiet", action="store_true", help="no progress and no table")
+    run.add_argument("--dry", action="store_true", help="say what would be done, and how long it would take; no step")
+
+    sweep = command("sweep", "a table over values of keys, a run for each; goes on where it was stopped", json=True)
+    _deck(sweep, "the scene, or the folder of a sweep that goes on")
+    varied = sweep.add_mutually_exclusive_group()
+    varied.add_argument(
+        "--vary",
+        action="append",
+        default=[],
+        metavar="KEY=A,B,...",
+        help="values of a key, each with each of others; keys that go together: KEY=A,B+KEY=C,D; repeatable",
+    )
+    varied.add_argument("--cases", type=Path, metavar="CSV", help="a table of cases: keys, and below them values")
+    sweep.add_argument("--ranks", type=_count, metavar="R", help="ranks of each case (1); of mpirun -n N: groups of R")
+    sweep.add_argument("--jobs", type=_count, default=1, metavar="J", help="cases at work at once, without mpirun (1)")
+    sweep.add_argument("--retry", action="store_true", help="compute broken cases again")
+    sweep.add_argument("--only", type=_count, metavar="N", help="case N alone and no table, as a task of an array job")
+    sweep.add_argument("--scheduler", choices=["slurm", "pbs"], help="write an array job, compute nothing")
+    _beside(sweep)
+
+    new = command("new", "write a deck with comments to begin with")
+    new.add_argument("kind", choices=KINDS, help="geometry: a label image, mesh files, or a shape")
+    new.add_argument("file", type=Path, nargs="?", help="the deck that is written (KIND.toml)")
+
+    check = command("check", "check a mesh file or a deck, and say what is in it and what it will take", json=True)
+    check.add_argument("file", type=Path, help="a mesh (Abaqus, LS-DYNA, or what meshio reads), or a deck (TOML)")
+    _set(check)
+
+    build = command("build", "build the model of a deck")
+    _deck(build)
+    build.add_argument("--ranks", type=_count, default=1, metavar="N", help="also partition it for so many ranks")
+
+    part = command("partition", "partition a model ahead of a job")
+    _model(part)
+    part.add_argument("parts", type=int, help="number of ranks")
+    part.add_argument("--seed", type=int, default=0, help="METIS's seed (0)")
+
+    report = command("report", "table, report.json and pictures of a run; the table of a sweep", json=True)
+    report.add_argument("directory", type=Path, help="the folder that a run or a sweep wrote")
+    _beside(report)
+
+    compare = command("compare", "errors of a result against a reference, in mm", json=True)
+    compare.add_argument("result", type=Path, help="the folder that a run wrote")
+    compare.add_argument(
+        "reference", type=Path, help=".npz, .csv, .vtu or .vtkhdf in metres, or a folder of another run"
+    )
+    compare.add_argument(
+        "--beyond", type=float, metavar="MM", help="also only places farther than this from edges of prescribed surface"
+    )
+
+    study = command("study", "error against run time over varied keys; goes on where it was stopped")
+    _deck(study)
+    study.add_argument(
+        "--vary",
+        action="append",
+        default=[],
+        metavar="KEY=A,B,...",
+        help="a family of runs; keys that go together: KEY=A,B+KEY=C,D; ranks=1,2 varies the ranks; repeatable",
+    )
+    study.add_argument("--reference", type=Path, help="what errors are against (see compare); else the own estimate")
+    study.add_argument("--beyond", type=float, metavar="MM", help="errors farther than this from prescribed edges")
+
+    stability = command(
+        "stability", "scenes taken to extremes: which complete, which stop; goes on where it was stopped"
+    )
+    stability.add_argument(
+        "--out", type=Path, default=Path("out/stability"), metavar="DIR", help="folder of the runs (%(default)s)"
+    )
+    stability.add_argument("--only", default="", metavar="AXIS,...", help="some of the axes, not all")
+
+    bench = command("bench", "speed of the step on fixed scenes, against what the machine can do")
+    bench.add_argument("--json", type=Path, metavar="FILE", help="write the outcome")
+    bench.add_argument("--compare", type=Path, metavar="OLD.json", help="exit status 1 if a case is 10 %% slower")
+    bench.add_argument("--ranks", metavar="N,...", help="numbers of ranks (1,2 where there are two cores)")
+    bench.add_argument("--quick", action="store_true", help="the smallest of each scene, in less time")
+    bench.add_argument("--omissions", action="store_true", help="instead: what each thing costs that a scene can lack")
+
+    predict = command("predict", "efficiency on a cluster, from real partitions in many parts")
+    _model(predict)
+    predict.add_argument(
+        "--parts", default="64,256,1024,4096,16384", metavar="N,...", help="numbers of ranks (%(default)s)"
+    )
+    predict.add_argument("--latency", type=float, metavar="US", help="microseconds a message takes (1.5)")
+    predict.add_argument("--bandwidth", type=float, metavar="GB/S", help="of one rank, in each direction (10)")
+    predict.add_argument("--rate", type=float, metavar="M", help="million hexahedra a second of one core (25)")
+    predict.add_argument("--fixed", type=float, metavar="US", help="microseconds of a step that depend on no size (15)")
+    predict.add_argument("--out", type=Path, metavar="DIR", help="folder of predict.csv and predict.png (the model's)")
+
+    export = command("export", "write a model as decks that run to the same result, here or elsewhere")
+    _model(export)
+    export.add_argument("--abaqus", action="store_true", required=True, help="as Abaqus decks and a CSV table")
+    export.add_argument("--out", type=Path, metavar="DIR", help="folder of the decks (export beside the model)")
+
+    info = command("info", "versions of what mpitled works with, and what is missing; or of a file", json=True)
+    info.add_argument("file", type=Path, nargs="?", help="model.h5 or result.vtkhdf: say what it is and holds")
+    return made
+
+
+def _deck(added: argparse.ArgumentParser, what: str = "the scene, a TOML file") -> None:
+    added.add_argument("deck", type=Path, help=what)
+    added.add_argument("--out", type=Path, metavar="DIR", help="folder of the results (out/NAME OF THE DECK)")
+    _set(added)
+
+
+def _set(added: argparse.ArgumentParser) -> None:
+    option: Any = added.add_argument(
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override a key of the deck; repeatable"
+    )
+    option.completer = _keys
+
+
+def _keys(prefix: str, **_: object) -> list[str]:
+    """For the shell's completion: keys of sections that are there once."""
+    from mpitled.deck import keys
+
+    return [f"{key}=" for key in keys() if key.startswith(prefix)]
+
+
+def _model(added: argparse.ArgumentParser) -> None:
+    added.add_argument("model", type=Path, help="model.h5, or the folder that holds it")
+
+
+def _beside(added: argparse.ArgumentParser) -> None:
+    added.add_argument("--beside", type=Path, metavar="CSV", help="rows of others for a sweep's table, by its keys")
+
+
+def _count(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{text}: give 1 or more")
+    return number

@@ -1,0 +1,23 @@
+"""Text files that are there whole or not at all, whenever the program is killed."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from mpitled.errors import InputError
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write UTF-8 text to a temporary file beside `path`, which then takes its name. InputError if the disc refuses."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with temporary.open("w", encoding="utf-8", newline="") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    finally:
+        temporary.unlink(missing_ok=True)

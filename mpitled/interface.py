@@ -1,0 +1,176 @@
+"""The Python interface: decks, models and runs for notebooks, and results that are read as they are asked for.
+
+Numbers of results are in SI units, those of reports in the units that their keys name.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpitled import preprocess, store
+from mpitled import run as runs
+from mpitled.cases import read as read_sweep
+from mpitled.deck import Deck, load_deck
+from mpitled.errors import InputError
+from mpitled.halo import World
+from mpitled.model import Model
+from mpitled.summary import collect, records
+
+__all__ = ["Frames", "RunResult", "build_model", "load_deck", "open_result", "open_sweep", "run_deck"]
+
+#: More than this is no small thing to hold at once, bytes.
+_LARGEST = 1 << 30
+
+
+def build_model(deck: Deck) -> Model:
+    """The discrete model of a deck, in memory. InputError if the mesh and the deck do not fit each other."""
+    return preprocess.build(deck)
+
+
+def run_deck(
+    deck: Deck | str | Path, directory: str | Path, overrides: Sequence[str] = (), *, quiet: bool = True
+) -> Any:
+    """Compute a deck into a directory on this process, or on all ranks under mpirun; its report, as report.json has it.
+
+    Overrides, "section.key=value", are for a deck that is given as a path. InputError, UnstableError or
+    InterruptedRun, alike on all ranks.
+    """
+    if not isinstance(deck, Deck):
+        deck = load_deck(deck, overrides)
+    elif overrides:
+        raise InputError("overrides: are for a deck given as a path; give them to load_deck")
+    return runs.run(deck, Path(directory), World(), quiet=quiet)
+
+
+def open_result(path: str | Path) -> RunResult:
+    """The result of a run: its folder, or the result.vtkhdf in it. InputError if there is none."""
+    return RunResult(store.open_result(Path(path)))
+
+
+def open_sweep(folder: str | Path) -> list[dict[str, Any]]:
+    """A record for each case of a sweep, as pandas.DataFrame takes them. InputError if the folder holds no sweep."""
+    return records(collect(read_sweep(Path(folder))))
+
+
+class Frames:
+    """An array for each frame, read when it is asked for: `frames[-1]` is the last."""
+
+    def __init__(self, read: Callable[[int], NDArray[Any]], n_frames: int) -> None:
+        self._read, self._n_frames = read, n_frames
+
+    def __len__(self) -> int:
+        return self._n_frames
+
+    def __getitem__(self, frame: int) -> NDArray[Any]:
+        if not -self._n_frames <= frame < self._n_frames:
+            raise IndexError(f"there are {self._n_frames} frames, and no {frame}")
+        return self._read(frame % self._n_frames)
+
+    def __iter__(self) -> Iterator[NDArray[Any]]:
+        return map(self._read, range(self._n_frames))
+
+
+class RunResult:
+    """What a run wrote. Nothing is read before it is asked for; nodes and cells are in the model's order."""
+
+    def __init__(self, result: store.Result) -> None:
+        self._result = result
+        self.path = result.path
+        self.complete = result.complete  # whether the run came to its end
+
+    def __enter__(self) -> RunResult:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._result.__exit__()
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """(n_frames,), s; of dynamic relaxation the share of the load."""
+        return self._result.times
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """(n_nodes, 3), m, undeformed."""
+        rows = self._result.point_data("node_id")
+        order = np.flatnonzero(rows >= 0)
+        return self._result.points[order[np.argsort(rows[order])]]
+
+    @property
+    def displacement(self) -> Frames:
+        """(n_nodes, 3), m, in each frame: the field u_h, at EFG nodes too."""
+        return self._frames(lambda frame: self._result.at_nodes("field_displacement", frame))
+
+    @property
+    def jacobian(self) -> Frames:
+        """(n_cells,), det F of hexahedra, then of support domains, in each frame."""
+        return self._frames(lambda frame: self._result.in_cells("J", frame))
+
+    @property
+    def history(self) -> dict[str, NDArray[np.float64]]:
+        """Energies (J) and other numbers, (n_frames,), by name, with "time": as pandas.DataFrame takes it."""
+        return {"time": self.times, **self._result.series}
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """The figures of report.json. InputError if there is none."""
+        path = self.path.parent / "report.json"
+        try:
+            return dict(json.loads(path.read_text(encoding="utf-8")))
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path}: cannot be read ({error}); make it: mpitled report {path.parent}") from None
+
+    def to_pyvista(self, frame: int = -1) -> Any:
+        """A frame as pyvista.UnstructuredGrid, undeformed, in metres: hexahedra, and vertices for the rest."""
+        try:
+            import pyvista
+        except ImportError:
+            raise InputError("to_pyvista: PyVista is missing; install it: pip install 'mpitled[python]'") from None
+        result, hexahedra = self._result, self._result.hexahedra
+        jacobian, numbers = result.cell_data("J", frame), result.point_data("node_id")
+        at_rows = np.full(len(numbers), np.nan)  # of integration points, which are the last cells, in the same order
+        at_rows[numbers < 0] = jacobian[len(jacobian) - np.count_nonzero(numbers < 0) :]
+        rest = np.setdiff1d(np.arange(len(numbers)), hexahedra)
+        cells = {pyvista.CellType.HEXAHEDRON: hexahedra, pyvista.CellType.VERTEX: rest[:, None]}
+        grid = pyvista.UnstructuredGrid({kind: nodes for kind, nodes in cells.items() if len(nodes)}, result.points)
+        grid.point_data["displacement"] = result.point_data("field_displacement", frame)
+        grid.cell_data["J"] = np.concatenate([jacobian[: len(hexahedra)], at_rows[rest]])
+        return grid
+
+    def to_xarray(self) -> Any:
+        """All frames as xarray.Dataset. InputError if they are more than a gigabyte."""
+        try:
+            import xarray
+        except ImportError:
+            raise InputError("to_xarray: xarray is missing; install it: pip install 'mpitled[python]'") from None
+        points, n_frames = self.points, len(self.times)
+        size = n_frames * (points.nbytes + self.jacobian[0].nbytes)
+        if size > _LARGEST:
+            raise InputError(f"to_xarray: {self.path} would take {size / 2**30:.1f} GiB; read single frames")
+        return xarray.Dataset(
+            {
+                "displacement": (("frame", "node", "axis"), np.stack(list(self.displacement)), {"units": "m"}),
+                "J": (("frame", "cell"), np.stack(list(self.jacobian))),
+                "points": (("node", "axis"), points, {"units": "m"}),
+                **{name: ("frame", values) for name, values in self._result.series.items()},
+            },
+            coords={"time": ("frame", self.times), "axis": list("xyz")},
+            attrs={"title": self._result.metadata["title"], "path": os.fspath(self.path)},
+        )
+
+    def _frames(self, read: Callable[[int], NDArray[Any]]) -> Frames:
+        return Frames(read, self._result.n_frames)

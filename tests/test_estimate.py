@@ -1,0 +1,125 @@
+"""What a run says of its distance to the static solution, against that distance, in scenes of every kind."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mpitled import report, run
+from mpitled.deck import load_deck
+from mpitled.halo import World
+from mpitled.store import open_result
+
+BRAIN = """
+[material.brain]
+youngs_modulus = 3000.0
+poissons_ratio = 0.49
+"""
+CLAMPED = """
+[block]
+size = [50.0, 50.0, 50.0]
+elements = [8, 8, 8]
+cloud = "{cloud}"
+[[fixed]]
+nodes = "z0"
+[[displaced]]
+nodes = "z1"
+displacement = [0.0, 0.0, -8.0]
+"""
+CYLINDER = """
+[cylinder]
+radius = 50.0
+height = 100.0
+element_size = 12.0
+[[fixed]]
+nodes = "bottom"
+[[displaced]]
+nodes = "top"
+displacement = [0.0, 0.0, 20.0]
+"""
+TORSION = """
+[block]
+corner = [-10.0, -10.0, 0.0]
+size = [20.0, 20.0, 80.0]
+elements = [4, 4, 16]
+[[fixed]]
+nodes = "z0"
+[[displaced]]
+nodes = "z1"
+displacement = [0.0, 0.0, 0.0]
+rotation = 90.0
+"""
+TUMOUR = """
+[ellipsoid]
+semi_axes = [32.0, 26.0, 24.0]
+element_size = 6.0
+cloud = "core"
+[tumour]
+centre = [6.0, 0.0, 3.0]
+volume = 113.1
+surface_nodes = 200
+[cloud]
+radius = 12.0
+growth = 0.3
+[[fixed]]
+nodes = "surface"
+"""
+#: Name -> deck, and the shortest load that the scene stands: steps of the relaxation, s of the ramp.
+SCENES = {
+    "compressed block of hexahedra": (CLAMPED.format(cloud="none"), 50, 0.15),
+    "compressed block with a cloud": (CLAMPED.format(cloud="core"), 50, 0.15),
+    "cylinder in extension": (CYLINDER, 50, 0.4),
+    "bar in torsion": (TORSION, 50, 0.4),
+    "tumour in an ellipsoid": (TUMOUR, 20, 0.1),
+}
+
+
+@pytest.fixture
+def compute(tmp_path, monkeypatch):
+    """Runs a scene's text with overrides: its report, and displacements (n, 3), mm. Pictures would take the time."""
+    monkeypatch.setattr(report, "_draw", lambda *_: [])
+
+    def compute(text, *overrides):
+        path = tmp_path / "scene.toml"
+        path.write_text(text + BRAIN)
+        made = run.run(load_deck(path, overrides), tmp_path / "out", World(), quiet=True)
+        with open_result(tmp_path / "out") as result:
+            return made, 1e3 * result.at_nodes("displacement", -1)
+
+    return compute
+
+
+def distance(u, v):
+    return np.linalg.norm(u - v, axis=1).max()
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_run_knows_its_distance_to_the_static_solution(compute, name):
+    """Within a factor of 3, of ramps that end moving and of relaxations that stop early."""
+    text, load_steps, load_time = SCENES[name]
+    relaxed = ("solver.method=dynamic-relaxation", f"solver.load_steps={load_steps}")
+    _, static = compute(text, *relaxed, "solver.tolerance=1e-6")
+    for overrides in (
+        ("solver.method=quasi-static", f"solver.load_time={load_time}"),
+        ("solver.method=quasi-static", f"solver.load_time={2 * load_time}"),
+        (*relaxed, "solver.tolerance=0.1"),
+        (*relaxed, "solver.tolerance=0.03"),
+    ):
+        made, u = compute(text, *overrides)
+        true, told = distance(u, static), made["static_distance_mm"]
+        print(f"{name}, {overrides[-1]}: {made['steps']} steps, {told:.4f} mm told, {true:.4f} mm true")
+        assert true / 3 < told < 3 * true
+
+
+@pytest.mark.parametrize("name", ["cylinder in extension", "bar in torsion"])
+def test_a_ramp_of_twice_the_steps_of_a_relaxation_is_farther_from_static(compute, name):
+    """The relaxation, loaded in 50 steps, is within 0.01 mm; the ramp still swings by more."""
+    text, load_steps, load_time = SCENES[name]
+    relaxed = ("solver.method=dynamic-relaxation", f"solver.load_steps={load_steps}")
+    _, static = compute(text, *relaxed, "solver.tolerance=1e-6")
+    relaxation, u = compute(text, *relaxed, "solver.tolerance=0.01")
+    assert distance(u, static) < 0.01
+    ramp, _ = compute(text, f"solver.load_time={load_time}")
+    ramp, u = compute(text, f"solver.load_time={2 * load_time * relaxation['steps'] / ramp['steps']}")
+    assert ramp["steps"] > 1.9 * relaxation["steps"]
+    assert distance(u, static) > 0.01

@@ -1,0 +1,120 @@
+"""First steps: decks to begin with, and what a person is told of a deck that is wrong."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+from conftest import ROOT, complaint, mpitled
+
+from mpitled import overview, scaffold
+from mpitled.arguments import KINDS
+from mpitled.deck import canonical, load_deck
+from mpitled.errors import InputError
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_new_deck_can_be_computed_as_it_is_and_tells_the_defaults(tmp_path, kind):
+    """Every key behind # has the value that took effect without it."""
+    path = tmp_path / "scene.toml"
+    assert scaffold.write(kind, path)[0] == path
+    said = overview.figures(path)
+    assert said["hexahedra"] > 0
+    assert said["run"]["steps"] > 100
+    assert not [remark for remark in said["remarks"] if "warning" in remark]
+    text = path.read_text()
+    shown = re.sub(r"^# (\w+ = .)", r"\1", text, flags=re.MULTILINE)
+    assert len(shown) < len(text) - 40
+    path.write_text(shown)
+    changed = canonical(load_deck(path))
+    path.write_text(text)
+    assert changed == canonical(load_deck(path))
+
+
+def test_a_new_deck_spares_what_is_there(tmp_path):
+    path = tmp_path / "cylinder.toml"
+    mpitled("new", "cylinder", path)
+    assert "is there already" in complaint(mpitled("new", "cylinder", path, status=2))
+    done = mpitled("run", path, "-q", "-v", "--json", "--out", tmp_path / "out", "--set", "solver.load_time=0.2", n=2)
+    assert json.loads(done.stdout)["max_displacement_mm"] == pytest.approx(4)
+    for rank in (0, 1):
+        assert f"rank {rank}: loop\n" in done.stderr
+
+
+BRAIN = """
+[labels]
+image = "{image}"
+element_size = 6.0
+[tumour]
+centre = [-26.0, -70.0, 3.0]
+volume = 4188.8
+[material.brain]
+youngs_modulus = 3000.0
+poissons_ratio = 0.49
+cells = ["tissue"]
+[material.csf]
+youngs_modulus = 10.0
+poissons_ratio = 0.1
+cells = ["left_ventricle", "right_ventricle"]
+[[fixed]]
+nodes = "skull"
+"""
+
+#: What a person writes instead of what is right, and what the message has to name and to advise.
+MISTAKES = {
+    "misspelt key": ("volume =", "volum =", "tumour.volum = 4188.8", "did you mean volume"),
+    "misspelt section": ("[tumour]", "[tumor]", "tumor", "did you mean tumour"),
+    "volume in m3": ("4188.8", "4.1888e-6", "tumour.volume", "mm3; give more"),
+    "negative volume": ("4188.8", "-4188.8", "tumour.volume = -4188.8", "above 0, in mm3"),
+    "centre outside of the head": ("[-26.0, -70.0", "[-26.0, -170.0", "tumour.centre", "mm"),
+    "seed in a ventricle": ("[-26.0, -70.0, 3.0]", "[-10.0, -20.0, 20.0]", "tumour.centre", "ventricle"),
+    "missing file": ("{image}", "no.nii.gz", "labels.image", "give a path relative to the deck"),
+    "element size in metres": ("element_size = 6.0", "element_size = 0.006", "element_size", "mm"),
+    "cells without a material": (', "right_ventricle"]', "]", "the first in right_ventricle", "name their set"),
+    "unknown set": ('nodes = "skull"', 'nodes = "skul"', "fixed.0.nodes", "skull"),
+    "incompressible": ("poissons_ratio = 0.49", "poissons_ratio = 0.5", "material.brain.poissons_ratio", "below 0.5"),
+    "two geometries": ("[tumour]", "[block]\nsize = [1, 1, 1]\nelements = [1, 1, 1]\n[tumour]", "[labels] and [block]",
+                       "exactly one"),
+    "number as text": ("3000.0", '"3 kPa"', "material.brain.youngs_modulus", "give a number above 0, in Pa"),
+    "nothing but a file": (BRAIN, "", "has no geometry", "give exactly one of [labels]"),
+}  # fmt: skip
+
+
+def wrong(tmp_path, old: str, new: str):
+    image = ROOT / "jobs" / "data" / "mni152_labels_2mm.nii.gz"
+    path = tmp_path / "wrong.toml"
+    assert old in BRAIN
+    path.write_text(BRAIN.replace(old, new, 1).replace("{image}", str(image)))
+    return path
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_wrong_deck_gets_a_message_to_act_on(tmp_path, mistake):
+    old, new, culprit, remedy = MISTAKES[mistake]
+    with pytest.raises(InputError) as caught:
+        overview.check(wrong(tmp_path, old, new))
+    message = str(caught.value)
+    assert culprit in message
+    assert remedy in message
+    assert "\n" not in message
+    assert len(message) < 500
+
+
+def test_a_slip_of_the_unit_that_is_possible_is_a_warning(tmp_path):
+    for old, new, word in (
+        ("youngs_modulus = 3000.0", "youngs_modulus = 0.003", "material.brain.youngs_modulus = 0.003: is it in Pa?"),
+        (
+            "poissons_ratio = 0.1\n",
+            "poissons_ratio = 0.1\ndensity = 1.0\n",
+            "material.csf.density = 1: is it in kg/m3?",
+        ),
+    ):
+        deck = load_deck(wrong(tmp_path, old, new))
+        assert word in "\n".join(overview.plausible(deck))
+    assert not list(overview.plausible(load_deck(wrong(tmp_path, "3000", "3000"))))
+
+
+def test_a_wrong_deck_ends_the_command_with_status_2(tmp_path):
+    old, new, culprit, _ = MISTAKES["negative volume"]
+    assert culprit in complaint(mpitled("check", wrong(tmp_path, old, new), "--json", status=2))

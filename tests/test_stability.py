@@ -1,0 +1,84 @@
+"""The stability matrix: its closed forms and meshes, what it makes of runs of every outcome, and that it goes on."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT, complaint, mpitled
+
+from mpitled import extremes, hexahedra, meshes, stability
+from mpitled.deck import MeshFiles
+from mpitled.exact import shell
+from mpitled.material import Material
+from mpitled.model import Model
+
+FEW = extremes.AXES["few"]
+
+
+def test_the_shell_is_that_of_an_independent_integration():
+    """Places on a line, as nodes of a model that has nothing else; R up to five times the seed's."""
+    with np.load(ROOT / "tests" / "data" / "C_shell_ode.npz") as data:
+        rho, material = data["rho"], Material("tissue", float(data["E"]), float(data["nu"]), 1000.0)
+        for R, u in zip(data["R"], data["u"], strict=True):
+            fields = dict.fromkeys(field.name for field in dataclasses.fields(Model))
+            points = np.outer(rho, [0.6, 0.0, 0.8])
+            fields |= {"points": points, "materials": (material,), "node_sets": {"tumour": np.array([0])}}
+            found = shell(Model(**fields), points, 4 / 3 * np.pi * R**3)
+            assert np.abs(found - np.outer(u, [0.6, 0.0, 0.8])).max() < 1e-9  # m, what both promise
+
+
+def test_grids_are_as_bad_as_they_are_asked_to_be(tmp_path):
+    extremes.write_grid(tmp_path, {"skew": "0.01"})
+    mesh = meshes.read_mesh(MeshFiles(fe=tmp_path / "grid.inp"))
+    assert hexahedra.scaled_jacobian(mesh.points, mesh.hexahedra).min() == pytest.approx(0.01, abs=1e-6)
+    assert hexahedra.volumes(mesh.points, mesh.hexahedra).sum() == pytest.approx(24**3)
+    extremes.write_grid(tmp_path, {"thin": "0.01,0.01,1"})
+    mesh = meshes.read_mesh(MeshFiles(fe=tmp_path / "grid.inp"))
+    # Beside the row that is 1/100 of a cell wide is one of 199/100.
+    assert hexahedra.aspect(mesh.points, mesh.hexahedra).max() == pytest.approx(199)
+
+
+def test_every_outcome_is_told_and_nothing_runs_twice(tmp_path, monkeypatch, capsys):
+    """Two cells pulled are homogeneous, pressed through themselves they stop, nu = 0.5 is refused."""
+    two = "grid.elements=1,1,2"
+    values = {
+        "pulled": two, "through itself": f"{two} displaced.0.displacement=[-45]",
+        "incompressible": f"{two} material.brain.poissons_ratio=0.5", "open": f"{two} grid.flaw=open",
+    }  # fmt: skip
+    axis = dataclasses.replace(FEW, values=values, kinds=("FE",), methods=("relaxation",))
+    monkeypatch.setitem(extremes.AXES, "two", axis)
+    monkeypatch.setitem(extremes.AXES, "false", dataclasses.replace(axis, values={"pulled": two}, reference="confined"))
+    for runs in (5, 1):
+        rows = stability.matrix(tmp_path, ["two", "false"])
+        assert capsys.readouterr().err.count("/5: ") == runs
+        assert [row["outcome"] for row in rows] == ["completed", "stopped", "stopped", "warned", "wrong"]
+        shutil.rmtree(next((tmp_path / "two-pulled").glob("FE-relaxation-*")))
+    assert rows[0]["error_mm"] < rows[0]["allowed_mm"]
+    assert rows[0]["allowed_mm"] < 0.04
+    assert "hexahedron" in rows[1]["message"]
+    assert "poissons_ratio" in rows[2]["message"]
+    assert "nodes lie where another one does" in rows[3]["message"]
+    assert rows[4]["error_mm"] > 1.0  # free sides against a mould
+    table = stability.summary(rows)
+    assert "| two | 4 | 1 | 2 | 1 | 0 |" in table
+    assert "wrong: false pulled, FE, relaxation" in table
+    with (tmp_path / "stability.csv").open(newline="") as file:
+        assert [row["outcome"] for row in csv.DictReader(file)] == [row["outcome"] for row in rows]
+    assert (tmp_path / "stability.png").stat().st_size > 5_000
+
+
+def test_unknown_axes_are_refused_before_anything_runs(tmp_path):
+    line = complaint(mpitled("stability", "--out", tmp_path / "out", "--only", "poisson,poison", status=2))
+    assert "poison:" in line
+    assert "growth" in line
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.study
+def test_nothing_in_the_matrix_is_wrong_and_silent(tmp_path: Path):
+    mpitled("stability", "--out", tmp_path, timeout=3600)

@@ -1,0 +1,200 @@
+"""Sweeps: the same table however it was computed and whenever it was killed, broken cases told, array jobs."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from conftest import ENVIRONMENT, ROOT, mpitled
+
+from mpitled import cases, open_sweep, screen, summary, vary
+from mpitled.errors import InputError
+
+CUBE = ROOT / "jobs" / "validation" / "cube.toml"
+#: Three cases on one model; half the height in one step turns cells inside out.
+WORDS = [
+    "sweep", CUBE, "--set", "solver.method=dynamic-relaxation", "--set", "block.elements=[2,2,2]",
+    "--vary", "solver.load_steps=400,500,1",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def groups(tmp_path_factory):
+    """The folder of the sweep that two groups of one rank computed, and what they said."""
+    out = tmp_path_factory.mktemp("sweep") / "out"
+    return out, mpitled(*WORDS, "--out", out, n=2, status=3).stderr
+
+
+def at_work(folder: Path) -> list[int]:
+    """Processes whose command names the folder."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            words = (process / "cmdline").read_bytes()
+        except OSError:
+            continue
+        if str(folder).encode() in words:
+            found.append(int(process.name))
+    return found
+
+
+def test_a_sweep_killed_at_work_gives_the_table_that_groups_of_ranks_give(tmp_path, groups):
+    by_groups, said = groups
+    with (by_groups / "table.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["solver.load_steps"] for row in rows] == ["400.0", "500.0", "1.0"]
+    assert ["unstable" in row["failure"] for row in rows] == [False, False, True]
+    assert float(rows[0]["min_jacobian"]) > 0
+    assert rows[2]["min_jacobian"] == ""
+    assert "3/3 solver.load_steps=1: broken: unstable" in said
+
+    out = tmp_path / "killed"
+    command = [str(Path(sys.executable).with_name("mpitled")), *map(str, WORDS), "--out", str(out)]
+    with subprocess.Popen(command, env=ENVIRONMENT, cwd=ROOT, stderr=subprocess.DEVNULL) as process:
+        deadline = time.time() + 60
+        while not list(out.glob("*/done.json")) and time.time() < deadline:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGKILL)
+    ended = {path: path.stat().st_mtime_ns for path in out.glob("*/done.json")}
+    assert 0 < len(ended) < 3
+    deadline = time.time() + 10
+    while at_work(out) and time.time() < deadline:
+        time.sleep(0.02)
+    assert at_work(out) == []  # what it had started ended with it
+    mpitled("sweep", out, status=3)
+    assert (out / "table.csv").read_bytes() == (by_groups / "table.csv").read_bytes()
+    assert all(path.stat().st_mtime_ns == then for path, then in ended.items())
+    assert len({path.stat().st_ino for path in out.glob("*/model.h5")}) == 1  # of all three
+
+    ended = {path: path.stat().st_mtime_ns for path in out.glob("*/done.json")}
+    again = mpitled("sweep", out, "--retry", status=3)
+    assert again.stderr.count("broken: unstable") == 1
+    assert sum(path.stat().st_mtime_ns == then for path, then in ended.items()) == 2
+
+
+def test_tables_for_programs_and_for_people(tmp_path, groups):
+    out, _ = groups
+    beside = tmp_path / "by_hand.csv"
+    beside.write_text("solver.load_steps,max_displacement_mm\n500,12.5\n")
+    assert "by hand" in mpitled("report", out, "--beside", beside, status=3).stdout
+    with h5py.File(out / "table.h5") as file:
+        assert file["table/solver.load_steps"][:].tolist() == [400, 500, 1]
+        assert (file["table/error_estimate_mm"][:2] < 0.01).all()  # the tolerance of relaxation
+        assert np.isnan(file["table/error_estimate_mm"][2])
+        assert [bool(text) for text in file["table/failure"].asstr()[:]] == [False, False, True]
+        assert (file["times/whole_s"][:2] > file["times/loop_s"][:2]).all()
+    lines = (out / "table.md").read_text().splitlines()
+    assert len(lines) == 6  # headings, rule, three cases, and the row of others below its own
+    assert "12.50" in lines[4]
+    page = (out / "table.html").read_text()
+    assert page.count("<tr>") == 5
+    for name in ("quantities.png", "cost.png"):
+        assert name in page
+        assert (out / name).stat().st_size > 10_000
+    assert [record["case"] for record in open_sweep(out)] == [1, 2, 3]
+
+
+def test_an_array_job_computes_each_task_alone(tmp_path):
+    """With launchers in the schedulers' place, which start what they are given."""
+    out, tools = tmp_path / "out", tmp_path / "bin"
+    words = ["--set", "block.elements=[2,2,2]", "--set", "solver.method=dynamic-relaxation"]
+    sweep = ["sweep", CUBE, *words, "--vary", "solver.load_steps=400,500,600", "--out", out]
+    tools.mkdir()
+    for name, skip in (("srun", 0), ("mpirun", 2)):
+        (tools / name).write_text(f'#!/bin/sh\nshift {skip}\nexec "$@"\n')
+        (tools / name).chmod(0o755)
+    path = os.pathsep.join([str(tools), str(Path(sys.executable).parent), ENVIRONMENT["PATH"]])
+    for scheduler, number in (("slurm", "SLURM_ARRAY_TASK_ID"), ("pbs", "PBS_ARRAY_INDEX")):
+        script = mpitled(*sweep, "--scheduler", scheduler).stdout.strip()
+        assert "1-3\n" in Path(script).read_text()
+        task = {"PATH": path, number: "2" if scheduler == "slurm" else "3"}
+        subprocess.run([script], env=ENVIRONMENT | task, check=True, timeout=120, stderr=subprocess.DEVNULL)
+    assert [case.failure for case in cases.read(out).cases] == [None, "", ""]
+    assert mpitled("report", out).stdout.count("not computed") == 1
+
+
+def test_a_screen_has_bars_on_a_terminal_alone(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    log = ["note: 3% of it", " 10%      9 s left  100 steps/s", " 45%      5 s left  100 steps/s", "written"]
+    assert screen.share_done(log) == 0.45
+    assert screen.share_done([]) == 0
+    for terminal in (True, False):
+        stream = Terminal() if terminal else io.StringIO()
+        monkeypatch.setattr(sys, "stderr", stream)
+        shown = screen.Screen()
+        shown.show({"a=1": 0.45, "a=2": 0.0}, 3)
+        shown.tell("1/5 a=1: done")
+        said = stream.getvalue()
+        assert ("\033[" in said) == terminal
+        assert (" 45% |" in said) == terminal
+        assert "1/5 a=1: done" in said
+    assert said == "1/5 a=1: done\n"
+
+
+def test_what_cannot_be_swept_is_said_before_anything_runs(tmp_path):
+    def plan(*texts: str) -> cases.Sweep:
+        return cases.plan(CUBE, vary.grid(texts), [], 1, tmp_path / "out")
+
+    for texts, word in (
+        (["solver.load_step=1,2"], "did you mean load_steps"),
+        (["solver.load_steps"], "key=value"),
+        (["a=1,2+b=3"], "as many values"),
+        (["solver.load_steps=5", "solver.load_steps=6"], "varied twice"),
+        (["solver.load_steps=5,5"], "cases 1 and 2 are the same"),
+    ):
+        with pytest.raises(InputError, match=word):
+            plan(*texts)
+    table = tmp_path / "cases.csv"
+    for text, word in (
+        ("", "has no cases"),
+        ("a,a\n1,2\n", "a key twice"),
+        ("a,b\n1\n", "line 2: has 1 values for 2 keys"),
+    ):
+        table.write_text(text)
+        with pytest.raises(InputError, match=word):
+            vary.table(table)
+    table.write_text("solver.load_steps,solver.tolerance\n5,\n6,0.1\n")
+    values = vary.table(table)
+    assert values == [{"solver.load_steps": "5"}, {"solver.load_steps": "6", "solver.tolerance": "0.1"}]
+    sweep = cases.plan(CUBE, values, [], 1, tmp_path / "out")
+    for text, word in (("solver.load_steps\n", "no column solver.tolerance"), ("x\n", "no column")):
+        table.write_text(text)
+        with pytest.raises(InputError, match=word):
+            summary.collect(sweep, table)
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(InputError, match="holds no sweep"):
+        cases.read(tmp_path)
+
+
+def test_the_longest_cases_are_known_beforehand(tmp_path):
+    brain = ROOT / "jobs" / "brain_tumour.toml"
+    keys = ["labels.element_size=4,3", "tumour.volume=113.1,4188.8"]
+    work = {case.words: case.work for case in cases.plan(brain, vary.grid(keys), [], 1, tmp_path).cases}
+    first, *_, last = sorted(work, key=lambda words: work[words])
+    assert "=4 " in first
+    assert "113.1" in first
+    assert "=3 " in last
+    assert "4188.8" in last
+
+
+def test_two_sweeps_do_not_work_in_one_folder(tmp_path):
+    fcntl = pytest.importorskip("fcntl")
+    shutil.rmtree(tmp_path / "out", ignore_errors=True)
+    (tmp_path / "out").mkdir()
+    with (tmp_path / "out" / ".lock").open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        done = mpitled("sweep", CUBE, "--vary", "solver.load_steps=5", "--out", tmp_path / "out", status=2)
+    assert "another sweep is at work" in done.stderr

@@ -1,0 +1,67 @@
+"""The table of the validation: resumable, its figures those of the runs, and what misses a goal stands out."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from test_compare import CYLINDER, SLOPE, synthetic
+
+from mpitled import charts
+
+
+@pytest.fixture(scope="module")
+def table():
+    spec = importlib.util.spec_from_file_location("table", ROOT / "jobs" / "validation" / "table.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["table"] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_scene_in_the_table(table, tmp_path, monkeypatch, capsys):
+    """The confined cube's compression is homogeneous, so that every mesh has it to what relaxation leaves."""
+    confined = ("block.elements=[3,3,3]", "fixed.0.nodes=surface", "fixed.1.nodes=surface")
+    cube = table.Scene(
+        "cube", "cube", "E3_cube_strain_50", 0, 0.02, confined, (1.0, 2.0, 3.0), "block", "block.elements=[4,4,4]"
+    )
+    monkeypatch.setattr(table, "SCENES", (cube,))
+    monkeypatch.setattr(table, "KINDS", {"none": "FE"})
+    rows = list(table.table_61(tmp_path, ["none"]))
+    assert [(row["mesh"], row["failure"], row["cells"]) for row in rows] == [("deck's", "", 27), ("finest", "", 64)]
+    for row in rows:
+        assert row["all_norm"] < 0.01 < row["goal"] == 0.02
+    assert capsys.readouterr().err.count("E3_cube_strain_50") == 2
+    again = list(table.table_61(tmp_path, ["none"]))
+    assert capsys.readouterr().err == ""  # nothing ran again
+    assert again == rows
+    again[1]["beyond_z"] = 0.021
+    *_, deck, finest = table.markdown(again, []).split("| cube ")
+    assert deck.startswith("| FE | deck's | 27 | 0.0")
+    assert "/ 0.021** | 0.020 | 1.000 / 2.000 / 3.000 |" in finest
+    assert "**" not in deck
+
+
+def test_distortion_of_an_affine_field(table, tmp_path):
+    """Every corner has the determinant of the gradient, and its least stretch is the compression."""
+    found = table.distortion(synthetic(tmp_path / "run", CYLINDER.format(cloud="none")))
+    gradient = np.eye(3) + SLOPE
+    assert found["corner_J"] == pytest.approx(np.linalg.det(gradient), rel=1e-9)
+    assert found["compression"] == pytest.approx(1 - np.linalg.svd(gradient, compute_uv=False).min(), rel=1e-9)
+
+
+def test_profiles_are_drawn(tmp_path):
+    """Two sides with a gap between them, and a run that is 0.3, 0.4 mm off."""
+    z = np.linspace(0, 100, 11)
+    side = np.stack([np.full(11, 50.0), 0 * z, z], axis=1)
+    places = np.concatenate([side, side * [-1, 1, 1]])
+    true = places * [0.1, 0, 0.2]
+    profile = charts.Profile("cylinder", places, true, {"FE": true + np.array([0.3, 0, 0.4])})
+    _, below = charts.draw_profiles([profile], tmp_path / "p.png").axes
+    along, apart = below.lines[0].get_data()
+    np.testing.assert_allclose(apart[~np.isnan(apart)], 0.5)
+    assert np.isnan(along).sum() == 1
+    assert (tmp_path / "p.png").stat().st_size > 10_000
