@@ -48,7 +48,7 @@ class AffineGrid:
         value = 1.0
         for _ in range(12):
             x = self._inverse * (self.system @ x)
-            value = float(np.linalg.norm(x))
+            value = float(np.linalg.norm(x)) or 1.0
             x /= value
         return 1.1 * value
 
