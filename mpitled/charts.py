@@ -126,7 +126,7 @@ def draw_prediction(rows: list[dict[str, Any]], subject: str, assumptions: str, 
     axes.set(xscale="log", ylim=(0, 105), xlabel="ranks", ylabel="predicted efficiency, %")
     axes.set_xticks(parts, [str(n) for n in parts])
     axes.minorticks_off()
-    axes.margins(x=0.15)
+    axes.margins(x=0.22)
     axes.grid(True, linewidth=0.3)
     axes.legend(fontsize=8, loc="lower left")
     axes.set_title(f"{subject}: {assumptions}", fontsize=8, loc="left")
