@@ -120,13 +120,13 @@ def draw_prediction(rows: list[dict[str, Any]], subject: str, assumptions: str, 
     for i, (label, values) in enumerate(lines.items()):
         axes.plot(parts, values, label=label, color=_COLOURS[i], marker=_MARKERS[i], linewidth=1.2)
     for row in rows:
-        text = f"{row['cells_mean']:.3g} cells\n{row['step_us']:.3g} us a step"
+        text = f"{row['cells_mean']:,.0f} cells\n{row['step_us']:,.0f} \u00b5s a step"
         place = (row["parts"], 100 * row["efficiency"])
-        axes.annotate(text, place, xytext=(0, -12), textcoords="offset points", fontsize=7, ha="center", va="top")
+        axes.annotate(text, place, xytext=(-8, -8), textcoords="offset points", fontsize=7, ha="right", va="top")
     axes.set(xscale="log", ylim=(0, 105), xlabel="ranks", ylabel="predicted efficiency, %")
     axes.set_xticks(parts, [str(n) for n in parts])
     axes.minorticks_off()
-    axes.margins(x=0.08)
+    axes.margins(x=0.22)
     axes.grid(True, linewidth=0.3)
     axes.legend(fontsize=8, loc="lower left")
     axes.set_title(f"{subject}: {assumptions}", fontsize=8, loc="left")
