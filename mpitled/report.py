@@ -109,7 +109,7 @@ def compute(outcome: Outcome) -> dict[str, Any]:
     report: dict[str, Any] = {
         "title": outcome.metadata.get("title", ""),
         "complete": outcome.complete,
-        "load_share": outcome.time / outcome.metadata["load_time_s"],
+        "load_share": min(1.0, outcome.time / outcome.metadata["load_time_s"]),
         "max_displacement_mm": 1e3 * float(size.max()),
         "share_over_5mm": {
             "volume": float(volumes[large].sum() / volumes.sum()),
