@@ -357,6 +357,22 @@ def test_what_one_of_four_ranks_breaks_ends_all_of_them_at_once(tmp_path, way):
     assert max(end["ended"] for end in ends) - min(end["detected"] for end in ends) < 1.0
 
 
+def test_a_result_that_is_not_to_be_trusted_says_so(tmp_path):
+    """A cube of support domains pressed to half its volume: the pressure is too much for their other modes."""
+    path = ROOT / "jobs" / "validation" / "cube.toml"
+    keys = ("block.elements=[5,5,5]", "block.cloud=all", "support.nodes=8", "solver.method=dynamic-relaxation")
+    keys = (*keys, "fixed.0.nodes=surface", "fixed.1.nodes=surface")
+    words = [word for key in keys for word in ("--set", key)]
+    said = mpitled("run", path, "-q", "--out", tmp_path / "soft", *words).stderr
+    assert "not to be trusted" in said
+    assert "support.stabilisation" in said
+    trusted = mpitled("run", path, "-q", "--out", tmp_path / "held", *words, "--set", "support.stabilisation=2")
+    assert not trusted.stderr
+    with open_result(tmp_path / "held") as result:
+        exact = result.points * [0, 0, -0.5]
+        assert np.abs(result.point_data("field_displacement", -1) - exact).max() < 1e-5
+
+
 @pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_leaves_a_readable_file(tmp_path, signal_number):
     path = deck(tmp_path, STRETCH, cloud="core", millimetres=3.0, load_time=500.0)
