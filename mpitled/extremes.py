@@ -201,7 +201,7 @@ AXES: dict[str, Axis] = {
     "slips": Axis("stretch by 20 %, decks written wrongly", _GRID + _MATERIAL + _STRETCH, {
         "nu 0.5": "material.brain.poissons_ratio=0.5",
         "E in MPa": "material.brain.youngs_modulus=3e-3",
-        "density in t/mm3": "material.brain.density=1e-9",
+        "rho in t/mm3": "material.brain.density=1e-9",
         "m for mm": "mesh.unit=m",
         "load in 1 us": "solver.load_time=1e-6",
         "no such set": "displaced.0.nodes=top",
