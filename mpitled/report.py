@@ -260,7 +260,7 @@ def _rim(faces: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def _draw(outcome: Outcome, directory: Path) -> list[str] | str:
     """Names of the pictures drawn, or why there are none."""
-    if not outcome.metadata["deck"]["output"].get("pictures", True):
+    if not outcome.metadata.get("deck", {}).get("output", {}).get("pictures", True):
         return "none, for output.pictures is false"
     try:
         import matplotlib  # noqa: F401  (optional: only the pictures need it)
