@@ -33,7 +33,7 @@ def inverted_cell(run: runs._Run, node: int) -> None:
 
 
 def main(deck: str, directory: Path, way: str) -> None:
-    world, ends, watch = World(), {}, runs._Run._watch
+    world, ends, watch = World(), {}, runs._Run._look
 
     def broken(run: runs._Run) -> None:
         try:
@@ -49,7 +49,7 @@ def main(deck: str, directory: Path, way: str) -> None:
             lonely[np.searchsorted(run.sub.rows.nodes, run.sub.rows.prescribed_dofs // 3)] = False
             globals()[way](run, int(np.flatnonzero(lonely)[0]))
 
-    runs._Run._watch = broken  # type: ignore[method-assign]
+    runs._Run._look = broken  # type: ignore[method-assign]
     try:
         cli.main(["run", "-q", deck, "--out", str(directory)])
     except SystemExit as end:
