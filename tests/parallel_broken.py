@@ -10,46 +10,49 @@ from pathlib import Path
 import numpy as np
 
 from mpitled import cli
-from mpitled import run as runs
 from mpitled.errors import UnstableError
 from mpitled.halo import World
+from mpitled.march import March
+from mpitled.step import State
+from mpitled.subdomain import Subdomain
+from mpitled.watch import Watch
 
 BREAKS, AT = 2, 0.3  # the rank that does, and the share of the load at which
 
 
-def step_too_long(run: runs._Run, node: int) -> None:
+def step_too_long(sub: Subdomain, state: State, node: int) -> None:
     """As if the step were 100 times as long, on this rank."""
-    run.method.state.mobility *= 1e4
+    state.mobility *= 1e4
 
 
-def not_a_number(run: runs._Run, node: int) -> None:
+def not_a_number(sub: Subdomain, state: State, node: int) -> None:
     """A displacement that is no number."""
-    run.method.state.u[0, node] = np.nan
+    state.u[0, node] = np.nan
 
 
-def inverted_cell(run: runs._Run, node: int) -> None:
+def inverted_cell(sub: Subdomain, state: State, node: int) -> None:
     """A node on the other side of its cells."""
-    run.method.state.u[0, node] += np.ptp(run.sub.rows.points[:, 0])
+    state.u[0, node] += np.ptp(sub.rows.points[:, 0])
 
 
 def main(deck: str, directory: Path, way: str) -> None:
-    world, ends, watch = World(), {}, runs._Run._watch
+    world, ends, look = World(), {}, Watch.look
 
-    def broken(run: runs._Run) -> None:
+    def broken(watch: Watch, method: March, interrupted: bool) -> None:
         try:
-            watch(run)
+            look(watch, method, interrupted)
         except UnstableError:
             ends["detected"] = time.time()
             raise
-        if world.rank == BREAKS and run.method.state.share > AT and "broken" not in ends:
+        if world.rank == BREAKS and method.state.share > AT and "broken" not in ends:
             ends["broken"] = time.time()
-            lonely = np.ones(run.sub.n_nodes, bool)  # what no other rank has, and nothing prescribes
-            for _, nodes in run.sub.shared:
+            lonely = np.ones(watch.sub.n_nodes, bool)  # what no other rank has, and nothing prescribes
+            for _, nodes in watch.sub.shared:
                 lonely[nodes] = False
-            lonely[np.searchsorted(run.sub.rows.nodes, run.sub.rows.prescribed_dofs // 3)] = False
-            globals()[way](run, int(np.flatnonzero(lonely)[0]))
+            lonely[np.searchsorted(watch.sub.rows.nodes, watch.sub.rows.prescribed_dofs // 3)] = False
+            globals()[way](watch.sub, method.state, int(np.flatnonzero(lonely)[0]))
 
-    runs._Run._watch = broken  # type: ignore[method-assign]
+    Watch.look = broken  # type: ignore[method-assign]
     try:
         cli.main(["run", "-q", deck, "--out", str(directory)])
     except SystemExit as end:
