@@ -257,4 +257,4 @@ def _words(cell: dict[str, Any]) -> str:
     if cell["error_mm"] != "":
         return f"{float(cell['error_mm']):.2g}"
     reached = re.search(r"unstable at ([\d.]+%)", cell["message"])
-    return reached[1] if reached else {2: "refused", 0: "error unsaid"}.get(cell["status"], "no end")
+    return reached[1] if reached else {3: "stalled", 2: "refused", 0: "error unsaid"}.get(cell["status"], "no end")

@@ -14,6 +14,7 @@ import csv
 import hashlib
 import io
 import json
+import os
 import re
 import shutil
 import sys
@@ -172,7 +173,7 @@ def _judge(case: Case, runs: _Runs) -> dict[str, Any]:
     except MpitledError as problem:
         return row | {"message": str(problem)}
     status = int(launch.about(folder)["status"])
-    row |= {"status": status, "message": failure}
+    row |= {"status": status, "message": failure.replace(f"{runs.deck.parent}{os.sep}", "")}
     if status:
         explained = {2: _REFUSED, 3: _UNSTABLE}.get(status)
         row["outcome"] = STOPPED if explained and explained.search(failure) else WRONG
