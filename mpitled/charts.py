@@ -196,11 +196,12 @@ def draw_rivals(panels: dict[str, list[dict[str, Any]]], path: Path, time: str, 
 _OUTCOMES = {
     "completed": ("#cbe7f8", _INK),
     "stopped": ("#f0c75e", _INK),
-    "warned": ("#9c9c9c", _INK),
+    "warned": ("#b8b8b8", _INK),
+    "buckled": ("#7a9a8f", _INK),
     "wrong": ("#5a1f00", "#ffffff"),
 }
-_CELL = (0.92, 0.2)  # inches
-_MARGIN, _HEAD, _WIDTH = 1.5, 0.62, 5.9  # inches left of a panel's cells, above them, and of a panel with both
+_CELL = (0.82, 0.2)  # inches
+_MARGIN, _HEAD, _WIDTH = 1.5, 0.62, 6.6  # inches left of a panel's cells, above them, and of a panel with both
 _PANELS = 3  # beside one another
 
 
@@ -226,8 +227,8 @@ def draw_matrix(rows: list[dict[str, Any]], path: Path) -> None:
     axes.axis("off")
     for i, (outcome, (colour, ink)) in enumerate(_OUTCOMES.items()):
         _cell(axes, 0.1 + i * 1.2 * _CELL[0], 0.1, outcome, colour, ink)
-    said = "completed, warned, wrong: error, mm; stopped: share of the load reached"
-    axes.text(0.1 + 4.9 * _CELL[0], 0.2, said, fontsize=7, va="center", color=_INK)
+    said = "completed, warned, buckled, wrong: error, mm; stopped: share of the load reached"
+    axes.text(0.1 + 6.1 * _CELL[0], 0.2, said, fontsize=7, va="center", color=_INK)
     for name, (column, top, runs) in places.items():
         left, top = column * _WIDTH + _MARGIN, top + _HEAD
         values = list(dict.fromkeys(cell["value"] for cell in panels[name]))
@@ -256,4 +257,4 @@ def _words(cell: dict[str, Any]) -> str:
     if cell["error_mm"] != "":
         return f"{float(cell['error_mm']):.2g}"
     reached = re.search(r"unstable at ([\d.]+%)", cell["message"])
-    return reached[1] if reached else {2: "refused", 0: "no reference"}.get(cell["status"], "no end")
+    return reached[1] if reached else {2: "refused", 0: "error unsaid"}.get(cell["status"], "no end")

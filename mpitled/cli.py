@@ -90,6 +90,9 @@ def _run(options: argparse.Namespace) -> None:
             print(told)
         return
     made = run(deck, _output(options), world, quiet=options.quiet)
+    if world.leads and options.quiet:
+        for text in made["warnings"]:
+            print(f"mpitled: warning: {text}", file=sys.stderr)
     if world.leads and (options.json or not options.quiet):
         from mpitled import report
 

@@ -25,6 +25,9 @@ from mpitled.model import Model
 REPORT, MODEL = "report.json", "model.h5"
 #: Displacements beyond this are large (paper, 6.2), m.
 LARGE = 5e-3
+#: What is warned of: energy of hourglass control and stabilisation as a share of the internal energy (right results
+#: have had up to 0.15, wrong ones from 0.3); a wrong volume balance; a distance to the static solution, mm.
+ARTIFICIAL, UNBALANCED, FAR = 0.2, 0.05, 0.5
 VENTRICLES = {"left": "left_ventricle", "right": "right_ventricle"}
 #: Exact to degree 3 in each coordinate; a bilinear face's volume integrand has degree 2.
 _GAUSS = (-(3**-0.5), 3**-0.5)
@@ -109,7 +112,7 @@ def compute(outcome: Outcome) -> dict[str, Any]:
     report: dict[str, Any] = {
         "title": outcome.metadata.get("title", ""),
         "complete": outcome.complete,
-        "load_share": outcome.time / outcome.metadata["load_time_s"],
+        "load_share": min(1.0, outcome.time / outcome.metadata["load_time_s"]),
         "max_displacement_mm": 1e3 * float(size.max()),
         "share_over_5mm": {
             "volume": float(volumes[large].sum() / volumes.sum()),
@@ -123,7 +126,30 @@ def compute(outcome: Outcome) -> dict[str, Any]:
     report |= _ventricles(outcome, fe_volumes)
     if outcome.centre is not None and len(outcome.seed):
         report |= _tumour(outcome, outcome.centre)
-    return report | outcome.figures
+    report |= outcome.figures
+    report["warnings"] = _warnings(report)
+    return report
+
+
+def _warnings(report: Mapping[str, Any]) -> list[str]:
+    """Why a result may not be what it seems, and the remedy."""
+    found = []
+    energy = report.get("energy_J", {})
+    if energy.get("internal", 0) > 0:
+        share = (energy["hourglass"] + energy["stabilisation"]) / energy["internal"]
+        if share > ARTIFICIAL:
+            found.append(
+                f"{share:.0%} of the internal energy is in modes that no cell's strain sees, so the displacements are "
+                "not to be trusted: refine the mesh or the cloud, or raise support.stabilisation"
+            )
+    if (error := report.get("volume_balance", {}).get("relative_error", 0.0)) > UNBALANCED:
+        found.append(f"{error:.0%} of the grown volume is lost: refine the cloud around the tumour (cloud.growth)")
+    if (distance := report.get("static_distance_mm", 0.0)) > FAR:
+        found.append(
+            f"the ramp ended {distance:.2g} mm from the static solution: load more slowly (solver.load_time), or take "
+            'solver.method = "dynamic-relaxation"'
+        )
+    return found
 
 
 def table(report: Mapping[str, Any]) -> str:
@@ -132,6 +158,7 @@ def table(report: Mapping[str, Any]) -> str:
     if not report["complete"]:
         lines.append(f"not complete: {report['load_share']:.1%} of the load time")
     lines += [f"  {name:<40}  {value}" for name, value in _rows(report)]
+    lines += [f"  warning: {text}" for text in report["warnings"]]
     pictures = report["pictures"]
     lines.append(f"  {'pictures':<40}  {', '.join(pictures) if isinstance(pictures, list) else pictures}")
     return "\n".join(lines)
@@ -233,7 +260,7 @@ def _rim(faces: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def _draw(outcome: Outcome, directory: Path) -> list[str] | str:
     """Names of the pictures drawn, or why there are none."""
-    if not outcome.metadata["deck"]["output"].get("pictures", True):
+    if not outcome.metadata.get("deck", {}).get("output", {}).get("pictures", True):
         return "none, for output.pictures is false"
     try:
         import matplotlib  # noqa: F401  (optional: only the pictures need it)

@@ -441,7 +441,7 @@ def leaves(table, name=""):
 
 
 #: Values for keys that hold a word: the first that the deck takes in place of its own.
-WORDS = ["quartic", "equal", "quasi-static", "centre", "all", "mm", "x", "dynamic", "other"]
+WORDS = ["recover", "single", "quartic", "equal", "quasi-static", "centre", "all", "mm", "x", "dynamic", "other"]
 
 
 def others(value):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mpitled import report, run
+from mpitled import run
 from mpitled.deck import load_deck
 from mpitled.halo import World
 from mpitled.store import open_result
@@ -75,14 +75,13 @@ SCENES = {
 
 
 @pytest.fixture
-def compute(tmp_path, monkeypatch):
-    """Runs a scene's text with overrides: its report, and displacements (n, 3), mm. Pictures would take the time."""
-    monkeypatch.setattr(report, "_draw", lambda *_: [])
+def compute(tmp_path):
+    """Runs a scene's text with overrides: its report, and displacements (n, 3), mm."""
 
     def compute(text, *overrides):
         path = tmp_path / "scene.toml"
         path.write_text(text + BRAIN)
-        made = run.run(load_deck(path, overrides), tmp_path / "out", World(), quiet=True)
+        made = run.run(load_deck(path, ("output.pictures=false", *overrides)), tmp_path / "out", World(), quiet=True)
         with open_result(tmp_path / "out") as result:
             return made, 1e3 * result.at_nodes("displacement", -1)
 

@@ -65,7 +65,7 @@ class Scene:
 
     def load(self, mesh: tuple[str, ...]) -> Deck:
         """The deck on one of the meshes."""
-        overrides = (*self.overrides, "solver.method=dynamic-relaxation", *mesh)
+        overrides = (*self.overrides, "solver.method=dynamic-relaxation", "output.pictures=false", *mesh)
         return load_deck(ROOT / "jobs" / "validation" / self.deck, overrides)
 
 
