@@ -22,6 +22,7 @@ FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3,
 CLOSEST = 0.6
 # Dart throwing at 0.83 of the spacing s ends with one node per s^3 (measured: 0.97 to 1.01).
 _DART = 0.83
+_CHUNK = 1 << 15  # places at once, so that the temporaries stay small
 _CANDIDATES = 24  # places per node that darts, Lloyd sweeps and shifts choose from
 _SWEEPS = 3  # of Lloyd; more change nothing, because nodes move from candidate to candidate
 _SAMPLES = 8  # points per direction in a cell that the seed's surface cuts
@@ -409,7 +410,10 @@ def _candidates(cells: NDArray[np.float64], spacing: Spacing, rng: np.random.Gen
     volumes, centroids = volumes_and_centroids(parts)
     wanted = _CANDIDATES * volumes / spacing(centroids) ** 3
     parent = np.repeat(np.arange(len(parts)), np.floor(wanted + rng.random(len(parts))).astype(np.int64))
-    places = _trilinear(parts[parent], rng.uniform(-1, 1, (len(parent), 3)))
+    places = np.empty((len(parent), 3))
+    for first in range(0, len(parent), _CHUNK):
+        rows = slice(first, min(first + _CHUNK, len(parent)))
+        places[rows] = _trilinear(parts[parent[rows]], rng.uniform(-1, 1, (rows.stop - first, 3)))
     return places[spacing.distance(places) > spacing.radius]
 
 

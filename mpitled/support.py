@@ -303,16 +303,21 @@ def _assemble(
     volumes: NDArray[np.float64],
     n_nodes: int,
 ) -> sparse.csr_matrix:
-    """The sum of V Q of all domains (G, n), in chunks; centred and inverse as in `linear_projector`."""
-    n = domains.shape[1]
-    total = sparse.csr_matrix((n_nodes, n_nodes))
-    for first in range(0, len(domains), 4 * _CHUNK):
-        rows = slice(first, first + 4 * _CHUNK)
-        blocks = np.eye(n) - 1 / n - centred[rows] @ inverse[rows] @ np.swapaxes(centred[rows], 1, 2)
-        blocks *= volumes[rows, None, None]
-        row, column = np.repeat(domains[rows], n, axis=1).ravel(), np.tile(domains[rows], (1, n)).ravel()
-        total = total + sparse.csr_matrix((blocks.ravel(), (row, column)), shape=(n_nodes, n_nodes))
-    return total
+    """The sum of V Q of all domains (G, n); centred and inverse as in `linear_projector`.
+
+    Q = 1 - M^T M, where M's four rows are an orthonormal basis of affine fields: no domain's own matrix is held.
+    """
+    n_domains, n = domains.shape
+    rows = np.empty((n_domains, 4, n))
+    rows[:, 0] = np.sqrt(volumes / n)[:, None]
+    root = np.linalg.cholesky(inverse * volumes[:, None, None])  # V A = root root^T
+    np.matmul(np.swapaxes(root, 1, 2), np.swapaxes(centred, 1, 2), out=rows[:, 1:])
+    columns = np.repeat(domains.astype(np.int32), 4, axis=0)
+    starts = np.arange(0, 4 * n_domains * n + 1, n)
+    affine = sparse.csr_matrix((rows.ravel(), columns.ravel(), starts), shape=(4 * n_domains, n_nodes))
+    del rows, columns
+    whole = np.bincount(domains.ravel(), np.repeat(volumes, n), n_nodes)
+    return (sparse.diags(whole) - affine.T @ affine).tocsr()
 
 
 def field_at_nodes(
