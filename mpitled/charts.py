@@ -185,10 +185,14 @@ def draw_rivals(panels: dict[str, list[dict[str, Any]]], path: Path, time: str, 
             points = [row for row in rows if row["family"] == family]
             seconds, found = ([row[name] for row in points] for name in ("seconds", "max_error_mm"))
             colour = _COLOURS[i + 1]
+            beside = {
+                "textcoords": "offset points",
+                "xytext": ((5, 4), (-5, -9))[i % 2],
+                "ha": ("left", "right")[i % 2],
+            }
             axes.plot(seconds, found, label=family, linewidth=1.2, color=colour, marker=_MARKERS[i])
             for x, y, row in zip(seconds, found, points, strict=True):
-                text = f"{row['unknowns']:,}"
-                axes.annotate(text, (x, y), xytext=(5, 4), textcoords="offset points", fontsize=7, color=colour)
+                axes.annotate(f"{row['unknowns']:,}", (x, y), fontsize=7, color=colour, **beside)
         _logarithmic(axes, time, error)
         axes.set_title(title)
     every[0].legend(fontsize=8, title="numbers: unknowns")

@@ -9,7 +9,8 @@ around the seed) with the same law on the same kind of meshes, in the elements t
 the nodes between the corners put on the curved surfaces. mpitled relaxes to 0.01 mm. Runs take turns, three of each;
 medians count. A process first solves a coarse mesh, so that imports and compilation are done with ("start_s"); what
 counts is the time from the deck to displacements: mesh and set-up ("setup_s"), and the solution ("solve_s"), assembly
-included. All times are processor times of one thread: other work on the machine hardly counts, and nothing waits.
+included, without the writing of results. All are processor times of one thread: other work on the machine hardly
+counts, and nothing waits.
 
 Needs FElupe and Pardiso: pip install -e '.[implicit]'
 """
