@@ -22,19 +22,22 @@ _MARKERS = "os^Dv<>P"
 _INK = "#222222"
 
 
-def _plain(value: float, _: Any) -> str:
-    """A tick of a logarithmic axis as a plain number; of those between the powers of ten only some."""
-    text = f"{value:g}"
-    return text if text.strip("0.")[:1] in ("1", "2", "3", "5", "7") else ""
-
-
 def _logarithmic(axes: Axes, x: str, y: str) -> None:
-    """Both axes, labelled so, logarithmic with plain numbers, and a grid."""
+    """Both axes, labelled so, logarithmic with plain numbers, and a grid.
+
+    Of the ticks between powers of ten only some have their number, the fewer the more powers there are.
+    """
     axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(_plain)
-        axis.set_minor_formatter(_plain)
     axes.margins(0.12)
+    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+        numbered = "12357" if high < 100 * low else "13"
+
+        def plain(value: float, _: Any, numbered: str = numbered) -> str:
+            text = f"{value:g}"
+            return text if text.strip("0.")[:1] in tuple(numbered) else ""
+
+        axis.set_major_formatter(plain)
+        axis.set_minor_formatter(plain)
     axes.grid(True, which="both", linewidth=0.3)
 
 
@@ -182,10 +185,14 @@ def draw_rivals(panels: dict[str, list[dict[str, Any]]], path: Path, time: str, 
             points = [row for row in rows if row["family"] == family]
             seconds, found = ([row[name] for row in points] for name in ("seconds", "max_error_mm"))
             colour = _COLOURS[i + 1]
+            beside = {
+                "textcoords": "offset points",
+                "xytext": ((5, 4), (-5, -9))[i % 2],
+                "ha": ("left", "right")[i % 2],
+            }
             axes.plot(seconds, found, label=family, linewidth=1.2, color=colour, marker=_MARKERS[i])
             for x, y, row in zip(seconds, found, points, strict=True):
-                text = f"{row['unknowns']:,}"
-                axes.annotate(text, (x, y), xytext=(5, 4), textcoords="offset points", fontsize=7, color=colour)
+                axes.annotate(f"{row['unknowns']:,}", (x, y), fontsize=7, color=colour, **beside)
         _logarithmic(axes, time, error)
         axes.set_title(title)
     every[0].legend(fontsize=8, title="numbers: unknowns")
