@@ -127,12 +127,13 @@ def compute(outcome: Outcome) -> dict[str, Any]:
     if outcome.centre is not None and len(outcome.seed):
         report |= _tumour(outcome, outcome.centre)
     report |= outcome.figures
-    report["warnings"] = _warnings(report)
+    solver = outcome.metadata.get("deck", {}).get("solver", {})
+    report["warnings"] = _warnings(report, solver.get("method") == "quasi-static")
     return report
 
 
-def _warnings(report: Mapping[str, Any]) -> list[str]:
-    """Why a result may not be what it seems, and the remedy."""
+def _warnings(report: Mapping[str, Any], ramped: bool) -> list[str]:
+    """Why a result may not be what it seems, and the remedy; ramped: the run was quasi-static."""
     found = []
     energy = report.get("energy_J", {})
     if energy.get("internal", 0) > 0:
@@ -148,6 +149,11 @@ def _warnings(report: Mapping[str, Any]) -> list[str]:
         found.append(
             f"the ramp ended {distance:.2g} mm from the static solution: load more slowly (solver.load_time), or take "
             'solver.method = "dynamic-relaxation"'
+        )
+    elif report["complete"] and ramped and "static_distance_mm" not in report:
+        found.append(
+            "how far the ramp ended from the static solution could not be found: load more slowly (solver.load_time), "
+            'or take solver.method = "dynamic-relaxation"'
         )
     return found
 

@@ -373,6 +373,12 @@ def test_a_result_that_is_not_to_be_trusted_says_so(tmp_path):
         assert np.abs(result.point_data("field_displacement", -1) - exact).max() < 1e-5
 
 
+def test_a_ramp_too_fast_for_any_estimate_says_so(tmp_path):
+    """In one step: nothing has moved but the nodes that were moved, and no relaxation leads on from there."""
+    path = deck(tmp_path, STRETCH, cloud="core", millimetres=6.0, load_time=1e-6)
+    assert "warning" in mpitled("run", path, "-q", "--out", tmp_path / "out").stderr
+
+
 @pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_leaves_a_readable_file(tmp_path, signal_number):
     path = deck(tmp_path, STRETCH, cloud="core", millimetres=3.0, load_time=500.0)
