@@ -51,8 +51,7 @@ class Case:
         if deck.block:
             cells = math.prod(deck.block.elements)
             edge = max(length / n for length, n in zip(deck.block.size, deck.block.elements, strict=True))
-        materials = [section.material for section in deck.materials]
-        speed = max((math.sqrt((m.lam + 2 * m.mu) / m.density) for m in materials), default=1.0)
+        speed = max((section.material.wave_speed for section in deck.materials), default=1.0)
         steps = (solver.load_time + solver.hold_time) * speed / edge
         if solver.method == "dynamic-relaxation":
             steps = solver.load_steps

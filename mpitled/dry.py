@@ -186,13 +186,14 @@ def _forecast(run: Any, step: float, survey: float) -> list[str]:
     """How many steps, and how long they take on the slowest rank by what was measured."""
     method, state = run.method, run.method.state
     if isinstance(method, March):
-        n, length = round(method.end / state.time_step), f" of {state.time_step:.4g} s"
+        length = f" of {state.time_step:.4g} s"
         more = "; the step may become shorter where cells need it, and longer again"
         if run.deck.solver.method == "quasi-static":
             more = "; then a relaxation to rest, to tell the distance to it"
     else:
-        n, length = round(state.load_time / state.time_step), " of load"
+        length = " of load"
         more = f"; then as many as come within {1e3 * method.tolerance:g} mm of rest, about as many again"
+    n = method.expected_steps
     n_surveys = math.ceil(n / method.between)
     return [
         f"steps: {n}{length}, {n_surveys} surveys{more}",

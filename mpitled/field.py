@@ -92,11 +92,7 @@ def open_field(path: Path, frame: int = -1) -> Field:
     """
     with store.open_result(path) as result:
         model = store.read_model(result.path.parent / "model.h5")
-        ids = result.point_data("node_id")
-        if (
-            np.count_nonzero(ids >= 0) != model.n_nodes
-            or (result.points[ids >= 0] != model.points[ids[ids >= 0]]).any()
-        ):
+        if not np.array_equal(result.node_points, model.points):
             raise InputError(f"{result.path}: is not a result of the model beside it; run the deck again")
         if result.n_frames == 0:
             raise InputError(f"{result.path}: has no frame; run the deck again")

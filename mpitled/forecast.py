@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tempfile
 import time
 from pathlib import Path
@@ -50,9 +49,7 @@ def forecast(deck: Deck, model: Model) -> Forecast:
         method = March(solver, frames, sub, world, None, None, model.figures)
     method.warm_up()
     method.begin()
-    steps = solver.load_steps
-    if isinstance(method, March):
-        steps = math.ceil(method.end / method.state.time_step * (1 - 1e-9))
+    steps = method.expected_steps
     taken, begin = 0, time.perf_counter()
     while taken < 3 or time.perf_counter() - begin < _MEASURED:
         for _, term in (*method.motion[-1:], *method.forces, *method.motion[:-1]):

@@ -106,9 +106,7 @@ class RunResult:
     @property
     def points(self) -> NDArray[np.float64]:
         """(n_nodes, 3), m, undeformed."""
-        rows = self._result.point_data("node_id")
-        order = np.flatnonzero(rows >= 0)
-        return self._result.points[order[np.argsort(rows[order])]]
+        return self._result.node_points
 
     @property
     def displacement(self) -> Frames:

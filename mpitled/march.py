@@ -34,6 +34,9 @@ class March:
     runs with `mass_scaling`) or the step shorter, with the central difference for variable steps.
     """
 
+    #: What has to be put back to return to an earlier state.
+    REMEMBERED = ("state", "added_mass", "added_energy", "frame")
+
     def __init__(
         self,
         solver: Solver,
@@ -100,6 +103,11 @@ class March:
         return self.state.time
 
     @property
+    def expected_steps(self) -> int:
+        """Steps of the whole run, if the step stays what it is."""
+        return round(self.end / self.state.time_step)
+
+    @property
     def progress(self) -> float:
         """Share of the run that is done."""
         return self.state.time / self.end
@@ -107,8 +115,7 @@ class March:
     def warm_up(self) -> None:
         """Call every kernel once, on the state at rest, without other ranks."""
         twin = copy(self)
-        twin.state, twin.halo, twin.sharpness = deepcopy(self.state), None, copy(self.sharpness)
-        twin.sharpness.wait, twin.sharpness.share = 1, 1.0
+        twin.state, twin.halo, twin.sharpness = deepcopy(self.state), None, self.sharpness.asleep()
         rehearse(twin.state, (*self.forces, *self.motion))
         twin.look()
 
@@ -164,14 +171,6 @@ class March:
         if due or allowed < s.time_step or allowed > REGAIN * s.time_step:
             self._take(self._fitting(allowed, self.frame * self.frame_span - s.time))
         return due, False
-
-    def remember(self) -> dict[str, Any]:
-        """All that `recall` needs to come back to the present."""
-        return {name: deepcopy(getattr(self, name)) for name in ("state", "added_mass", "added_energy", "frame")}
-
-    def recall(self, saved: dict[str, Any]) -> None:
-        for name, value in deepcopy(saved).items():
-            setattr(self, name, value)
 
     def harden(self) -> None:
         """Go on with steps shorter by a third, or twice the mass where the step needs it, watched twice as often."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import partition
-from mpitled import store
+from mpitled import atomic, store
 from mpitled.errors import InputError
 from mpitled.run import DOMAIN_NODE_COST
 
@@ -66,7 +64,8 @@ def predict(path: Path, counts: Sequence[int], cluster: Cluster, out: Path, seed
         tables = partition.tables(hexahedra, domains, finer[1] // (finer[0] // n_parts), n_parts)
         rows.insert(0, step_time(partition.figures(tables, costs, len(hexahedra)), cluster))
     out.mkdir(parents=True, exist_ok=True)
-    _write_table(out / "predict.csv", rows)
+    written = [{k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows]
+    atomic.write_csv(out / "predict.csv", COLUMNS, written)
     try:
         from mpitled import charts
     except ImportError:
@@ -120,15 +119,6 @@ def step_time(figures: partition.PartFigures, cluster: Cluster) -> dict[str, Any
 
 def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
-
-
-def _write_table(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    temporary = path.with_name(f".{path.name}")
-    with temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
-    os.replace(temporary, path)
 
 
 def table(rows: Sequence[dict[str, Any]], cluster: Cluster) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from copy import copy, deepcopy
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +36,9 @@ class Relaxation:
     growing seed run into them. The distance to the static solution is taken from the slowest mode, as its
     speed over its frequency and as its acceleration over its frequency squared, whichever is more.
     """
+
+    #: What has to be put back to return to an earlier state.
+    REMEMBERED = ("state", "u_then", "f_then", "lowest", "distance", "frame", "settled", "best", "waited")
 
     def __init__(
         self,
@@ -88,6 +90,11 @@ class Relaxation:
         return self.state.share
 
     @property
+    def expected_steps(self) -> int:
+        """Steps in which the load grows; how many follow nobody knows beforehand."""
+        return round(self.load_time)
+
+    @property
     def progress(self) -> float:
         """Share of the run that is done, as far as one can tell: half for the load, half for what follows."""
         s = self.state
@@ -99,8 +106,7 @@ class Relaxation:
     def warm_up(self) -> None:
         """Call every kernel once, on the state at rest, without other ranks."""
         twin = copy(self)
-        twin.state, twin.halo, twin.sharpness = deepcopy(self.state), None, copy(self.sharpness)
-        twin.sharpness.wait, twin.sharpness.share = 1, 1.0
+        twin.state, twin.halo, twin.sharpness = deepcopy(self.state), None, self.sharpness.asleep()
         twin.u_then, twin.f_then = self.u_then.copy(), self.f_then.copy()
         rehearse(twin.state, (*self.forces, *self.motion))
         twin.look()
@@ -128,15 +134,6 @@ class Relaxation:
             "change": change,
             "residual": residual,
         }
-
-    def remember(self) -> dict[str, Any]:
-        """All that `recall` needs to come back to the present."""
-        names = ("state", "u_then", "f_then", "lowest", "distance", "frame", "settled", "best", "waited")
-        return {name: deepcopy(getattr(self, name)) for name in names}
-
-    def recall(self, saved: dict[str, Any]) -> None:
-        for name, value in deepcopy(saved).items():
-            setattr(self, name, value)
 
     def harden(self) -> None:
         """Go on from rest, with masses twice as large and the load half as fast, watched twice as often."""

@@ -83,10 +83,7 @@ def read(directory: Path) -> Outcome:
         if result.n_frames == 0:
             raise InputError(f"{result.path}: holds no frame yet; run the deck again")
         model = store.read_model(directory / MODEL)
-        numbers = result.point_data("node_id")
-        of_nodes = np.flatnonzero(numbers >= 0)
-        places = result.points[of_nodes[np.argsort(numbers[of_nodes])]]
-        if not np.array_equal(places, model.points) or len(result.in_cells("J")) != model.n_cells:
+        if not np.array_equal(result.node_points, model.points) or len(result.in_cells("J")) != model.n_cells:
             raise InputError(f"{result.path}: is not of the model beside it, {MODEL}; run the deck again")
         return Outcome(
             model=model,

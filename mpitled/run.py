@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -259,7 +260,9 @@ class _Run:
                 seconds[name] += clock() - begin
 
         step, last = (*update, *forces, *reactions), False
-        saved: deque[Any] = deque(maxlen=2)  # to go back to the older of them; the younger may be ill already
+        saved: deque[dict[str, Any]] = deque(
+            maxlen=2
+        )  # to go back to the older of them; the younger may be ill already
         take((*forces, *reactions))
         for look in count():
             try:
@@ -270,7 +273,8 @@ class _Run:
                     self._write_last_good(writer)
                     raise
                 self.recoveries += 1
-                method.recall(saved[0])
+                for name, value in deepcopy(saved[0]).items():
+                    setattr(method, name, value)
                 method.harden()
                 continue
             due, last = method.decide(self.watch.figures)
@@ -282,7 +286,7 @@ class _Run:
             if self.deck.solver.on_inversion == "recover" and (due or look % SAVED == 0):
                 if due:
                     saved.clear()  # what is written stays
-                saved.append(method.remember())
+                saved.append({name: deepcopy(getattr(method, name)) for name in method.REMEMBERED})
             for _ in range(method.between):
                 take(step)
 

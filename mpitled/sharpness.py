@@ -45,6 +45,12 @@ class Sharpness:
         # m, of the largest displacement that is tried: well above round-off, well below a cell.
         self._reach = float(np.finfo(sub.precision).eps) ** 0.5 * 0.02 * float(world.gather([spread]).max())
 
+    def asleep(self) -> Sharpness:
+        """A copy that asks nothing of other ranks at the next survey."""
+        twin = copy(self)
+        twin.share, twin.wait = 1.0, 1
+        return twin
+
     def due(self) -> bool:
         """Whether it is time to renew the share; called once a survey."""
         self.wait -= 1

@@ -10,9 +10,7 @@ difference is, their error is as many times that of a run at half that step as t
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import json
 import os
 import re
@@ -102,7 +100,7 @@ def matrix(out: Path, only: Sequence[str] = ()) -> list[dict[str, Any]]:
         deck = _write_deck(folder, case)
         run = _Runs(deck, case, f"{i}/{len(todo)}")
         rows.append(_judge(case, run))
-    atomic.write_text(out / "stability.csv", _csv(rows))
+    atomic.write_csv(out / "stability.csv", COLUMNS, rows)
     try:
         from mpitled import charts
     except ImportError:
@@ -265,14 +263,6 @@ def _field(folder: Path) -> tuple[Model, NDArray[np.float64], float]:
     with store.open_result(folder) as result:
         tolerance = float(result.metadata["deck"]["solver"]["tolerance"])
         return store.read_model(folder / "model.h5"), result.at_nodes("field_displacement", -1), tolerance
-
-
-def _csv(rows: list[dict[str, Any]]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
 
 
 def summary(rows: list[dict[str, Any]]) -> str:

@@ -798,6 +798,11 @@ class Result:
         """Values in cells: hexahedra, EFG nodes (nan or -1 where it is nothing of theirs), integration points."""
         return self._rows("Cell", name, frame)
 
+    @property
+    def node_points(self) -> NDArray[np.float64]:
+        """(n_nodes, 3), m, undeformed, in the order of the model."""
+        return self.points[_ascending(self.point_data("node_id"))]
+
     def at_nodes(self, name: str, frame: int = 0) -> NDArray[Any]:
         """Point data of the nodes, in the order of the model."""
         return self.point_data(name, frame)[_ascending(self.point_data("node_id"))]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import sys
 from collections.abc import Iterator, Sequence
@@ -70,7 +68,7 @@ def study(
         rows.append(_row(variant, failure, folder, reference, beyond))
     for row in rows:
         row["pareto"] = _is_best(row, rows)
-    atomic.write_text(out / "study.csv", _csv(rows))
+    atomic.write_csv(out / "study.csv", COLUMNS, rows)
     try:
         from mpitled import charts
     except ImportError:
@@ -115,14 +113,6 @@ def _is_best(row: dict[str, Any], rows: list[dict[str, Any]]) -> bool:
         and (other["max_error_mm"], other["loop_s"]) != (row["max_error_mm"], row["loop_s"])
         for other in others
     )
-
-
-def _csv(rows: list[dict[str, Any]]) -> str:
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, COLUMNS)
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
 
 
 def table(rows: list[dict[str, Any]]) -> str:

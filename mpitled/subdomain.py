@@ -79,10 +79,6 @@ class Subdomain:
     shared: tuple[tuple[int, NDArray[np.uint32]], ...]  # (rank, nodes shared with it), ranks ascending
     precision: type[np.floating]  # of the cells' arithmetic
 
-    @property
-    def n_owned(self) -> int:
-        return int(np.count_nonzero(self.rows.owned))
-
     def free(self) -> NDArray[np.float64]:
         """(3, n_nodes): 1 at free dofs, 0 at prescribed ones."""
         free = np.ones((3, self.n_nodes))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import html
-import io
 import json
 import math
 import sys
@@ -87,8 +86,8 @@ def write(sweep: Sweep, table: Table) -> list[Path]:
     """Write table.csv, times.csv, table.h5, table.md, table.html and the charts into the sweep's folder."""
     folder = sweep.folder
     paths = [folder / name for name in ("table.csv", "times.csv", "table.h5", "table.md", "table.html")]
-    atomic.write_text(paths[0], _csv(table.rows))
-    atomic.write_text(paths[1], _csv(table.times))
+    atomic.write_csv(paths[0], list(table.rows[0]), table.rows)
+    atomic.write_csv(paths[1], list(table.times[0]), table.times)
     groups = {"table": table.rows, "times": table.times}
     store.write_columns(paths[2], {name: _columns(rows) for name, rows in groups.items()})
     atomic.write_text(paths[3], markdown(table))
@@ -175,14 +174,6 @@ def _read_beside(path: Path, keys: Sequence[str], rows: Sequence[Row]) -> dict[i
             if all(row[key] == their[key] for key in keys):
                 found[int(row["case"])] = their
     return found
-
-
-def _csv(rows: Sequence[Row]) -> str:
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
 
 
 def _columns(rows: Sequence[Row]) -> dict[str, list[float | str]]:
