@@ -43,11 +43,12 @@ class Material:
 _STIFFEST = 51.0
 
 
-def stabilising_modulus(lam: NDArray[np.float64], mu: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What hourglass control (eq. 4.22) and stabilisation are a share of, Pa: lambda + 2 mu, at most that of nu = 0.49.
+def hourglass_modulus(lam: NDArray[np.float64], mu: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What hourglass control (eq. 4.22) is a share of, Pa: lambda + 2 mu, at most that of nu = 0.49.
 
-    The modes that they hold keep their volume to first order: towards nu = 0.5 a share of lambda would lock them. At
-    nu = 0.499 the paper's constant without the limit doubles the largest error of a stretched cylinder.
+    Hourglass modes keep the volume to first order: towards nu = 0.5 a share of lambda would lock them. At nu = 0.499
+    without the limit the largest error of a stretched cylinder doubles. The modes of support domains have to hold
+    against pressure, which such a limit lets tumours grow through: they are stabilised with the whole lambda + 2 mu.
     """
     return np.minimum(lam + 2 * mu, _STIFFEST * mu)
 

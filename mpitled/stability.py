@@ -31,8 +31,9 @@ from mpitled.extremes import AXES, KINDS, METHODS, Axis, write_grid
 from mpitled.material import strain_energy
 from mpitled.model import Model
 
-#: Warned: the field is not that of the reference, but the mesh was warned of when it was read. Buckled: it is not that
-#: of a closed form which the mesh has exactly, but it holds less energy: the closed form is no stable equilibrium.
+#: Warned: the field is not that of the reference, but the mesh was warned of when it was read, or the result when it
+#: was there. Buckled: it is not that of a closed form which the mesh has exactly, but it holds less energy: the closed
+#: form is no stable equilibrium.
 OUTCOMES = RIGHT, STOPPED, WARNED, BUCKLED, WRONG = "completed", "stopped", "warned", "buckled", "wrong"
 COLUMNS = (
     "axis", "about", "value", "kind", "method", "outcome", "status", "error_mm", "allowed_mm", "reference",
@@ -190,9 +191,12 @@ def _judge(case: Case, runs: _Runs) -> dict[str, Any]:
     except MpitledError as problem:
         return row | {"message": str(problem)}
     own = report.get("static_distance_mm")
-    if own is None and case.method != "waves":
-        return row | {"message": "does not say how far from the static solution it ended"}
     model, field, tolerance = _field(folder)
+    warnings = [*report["warnings"], *(remark for remark in model.remarks if remark.startswith("warning: "))]
+    if own is None and case.method != "waves":
+        if warnings:
+            return row | {"outcome": WARNED, "message": " | ".join(warnings)}
+        return row | {"message": "does not say how far from the static solution it ended"}
     round_off = ROUND_OFF * 1e3 * float(np.ptp(model.points, axis=0).max())
     exact = case.axis.reference in CLOSED_FORMS and allowed < round_off
     if own is not None:
@@ -202,7 +206,7 @@ def _judge(case: Case, runs: _Runs) -> dict[str, Any]:
     row |= {"error_mm": error, "allowed_mm": allowed}
     if error <= allowed:
         return row | {"outcome": RIGHT}
-    if warnings := [remark for remark in model.remarks if remark.startswith("warning: ")]:
+    if warnings:
         return row | {"outcome": WARNED, "message": " | ".join(warnings)}
     if exact and (energy := _energy(model, reference)) > report["energy_J"]["internal"]:
         words = f"holds {report['energy_J']['internal']:.3g} J, less than the closed form with {energy:.3g} J"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mpitled import hexahedra, support
 from mpitled.kernels import BATCH_LANES, VOXEL_LANES
-from mpitled.material import stabilising_modulus
+from mpitled.material import hourglass_modulus
 from mpitled.mesh import CORNERS
 from mpitled.store import PartRows
 
@@ -195,7 +195,7 @@ def _voxel_runs(
         first_cell=first.astype(np.uint64),
         scale=1 / (4 * edge),
         coefficient=np.stack(
-            [mu * volume, lam * volume, hourglass * stabilising_modulus(lam, mu) * volume * gram.sum(axis=0) / 8]
+            [mu * volume, lam * volume, hourglass * hourglass_modulus(lam, mu) * volume * gram.sum(axis=0) / 8]
         ),
         gram=gram,
     )
@@ -217,7 +217,7 @@ def _hexahedron_batches(
     gradients, _ = hexahedra.geometry(points, nodes, rule)
     gamma = hexahedra.hourglass_vectors(points, nodes, gradients)
     mu, lam = lame[:, chosen]
-    k = hexahedra.hourglass_stiffness(gradients, volumes, stabilising_modulus(lam, mu), hourglass)
+    k = hexahedra.hourglass_stiffness(gradients, volumes, hourglass_modulus(lam, mu), hourglass)
     geometry = np.concatenate([gradient_modes.reshape(-1, 18) / 8, x_modes.reshape(-1, 12)], axis=1)
     return HexahedronBatches(
         nodes=_lanes(nodes),
@@ -237,7 +237,7 @@ def _domain_batches(
     position, inverse = support.linear_projector(rows.points[nodes])
     mu, lam = lame
     volume = rows.domain_volumes
-    kappa = support.stabilisation_stiffness(inverse, volume, stabilising_modulus(lam, mu), stabilisation)
+    kappa = support.stabilisation_stiffness(inverse, volume, lam + 2 * mu, stabilisation)
     gram = np.einsum("gai,gaj->gij", rows.domain_gradients, rows.domain_gradients)
     numbers = np.arange(len(rows.hexahedra), len(rows.cells), dtype=np.uint32)
     stabilised = stabilisation > 0
