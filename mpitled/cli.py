@@ -16,7 +16,7 @@ from mpitled import arguments
 from mpitled.errors import InputError, MpitledError
 
 if TYPE_CHECKING:
-    from mpitled.cases import Sweep
+    from mpitled.batch.cases import Sweep
 
 # Modules are imported by the command that needs them: `--help` must not wait for compilers and libraries.
 
@@ -45,7 +45,7 @@ def main(words: Sequence[str] | None = None) -> NoReturn:
 
 def _end(error: Exception, status: int) -> NoReturn:
     """One message, and the end of every rank: alike if all know of the error, else by aborting the job."""
-    from mpitled.halo import World
+    from mpitled.solver.halo import World
 
     world = World()
     if getattr(error, "everywhere", False) or world.size == 1:
@@ -60,7 +60,7 @@ def _log_phases() -> None:
     """Phases of the work on stderr, with the time and the rank."""
     import logging
 
-    from mpitled.halo import World
+    from mpitled.solver.halo import World
 
     logging.basicConfig(format=f"%(asctime)s rank {World().rank}: %(message)s", level=logging.WARNING)
     logging.getLogger("mpitled").setLevel(logging.INFO)
@@ -76,14 +76,14 @@ def _output(options: argparse.Namespace) -> Path:
 
 def _run(options: argparse.Namespace) -> None:
     from mpitled.deck import load_deck
-    from mpitled.halo import World
-    from mpitled.run import everywhere, run
+    from mpitled.solver.halo import World
+    from mpitled.solver.run import everywhere, run
 
     world = World()
     with everywhere():  # each rank reads the same file
         deck = load_deck(options.deck, options.set)
     if options.dry:
-        from mpitled.dry import dry_run
+        from mpitled.speed.dry import dry_run
 
         told = dry_run(deck, _output(options), world)
         if world.leads:
@@ -94,7 +94,7 @@ def _run(options: argparse.Namespace) -> None:
         for text in made["warnings"]:
             print(f"mpitled: warning: {text}", file=sys.stderr)
     if world.leads and (options.json or not options.quiet):
-        from mpitled import report
+        from mpitled.results import report
 
         _print(made, report.table, options)
         if not options.json:
@@ -102,9 +102,9 @@ def _run(options: argparse.Namespace) -> None:
 
 
 def _sweep(options: argparse.Namespace) -> int:
-    from mpitled import cases, sweep, vary
-    from mpitled.halo import World
-    from mpitled.run import everywhere
+    from mpitled.batch import cases, sweep, vary
+    from mpitled.solver.halo import World
+    from mpitled.solver.run import everywhere
 
     world = World()
     with everywhere():  # each rank reads the same files
@@ -128,7 +128,7 @@ def _sweep(options: argparse.Namespace) -> int:
 
 def _tabulate(plan: Sweep, options: argparse.Namespace) -> int:
     """Write and print the table of a sweep; 3 if a case is broken."""
-    from mpitled import summary
+    from mpitled.batch import summary
 
     table = summary.collect(plan, options.beside)
     summary.write(plan, table)
@@ -150,7 +150,7 @@ def _new(options: argparse.Namespace) -> None:
 
 def _build(options: argparse.Namespace) -> None:
     from mpitled.deck import load_deck
-    from mpitled.run import build, ensure_partition
+    from mpitled.solver.run import build, ensure_partition
     from mpitled.store import describe_model
 
     deck = load_deck(options.deck, options.set)
@@ -161,7 +161,7 @@ def _build(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    from mpitled import overview
+    from mpitled.speed import overview
 
     if options.json:
         print(json.dumps(overview.figures(options.file, options.set), indent=2))
@@ -178,13 +178,13 @@ def _export(options: argparse.Namespace) -> None:
 
 
 def _model(path: Path) -> Path:
-    from mpitled.run import MODEL
+    from mpitled.solver.run import MODEL
 
     return path / MODEL if path.is_dir() else path
 
 
 def _partition(options: argparse.Namespace) -> None:
-    from mpitled.run import divide
+    from mpitled.solver.run import divide
 
     path = _model(options.model)
     if options.parts < 2:
@@ -193,7 +193,8 @@ def _partition(options: argparse.Namespace) -> None:
 
 
 def _report(options: argparse.Namespace) -> int:
-    from mpitled import cases, report
+    from mpitled.batch import cases
+    from mpitled.results import report
 
     if cases.is_sweep(options.directory):
         return _tabulate(cases.read(options.directory), options)
@@ -202,14 +203,14 @@ def _report(options: argparse.Namespace) -> int:
 
 
 def _compare(options: argparse.Namespace) -> None:
-    from mpitled import compare
+    from mpitled.results import compare
 
     figures = compare.compare(options.result, options.reference, options.beyond and options.beyond / 1e3)
     _print(figures, compare.table, options)
 
 
 def _study(options: argparse.Namespace) -> None:
-    from mpitled import study
+    from mpitled.batch import study
 
     beyond = options.beyond and options.beyond / 1e3
     out = options.out or Path("out") / f"study_{options.deck.stem}"
@@ -218,10 +219,10 @@ def _study(options: argparse.Namespace) -> None:
 
 
 def _bench(options: argparse.Namespace) -> int:
-    from mpitled import bench
+    from mpitled.speed import bench
 
     if options.omissions:
-        from mpitled import omissions
+        from mpitled.speed import omissions
 
         print(omissions.measure(options.quick))
         return 0
@@ -241,7 +242,7 @@ def _bench(options: argparse.Namespace) -> int:
 def _predict(options: argparse.Namespace) -> None:
     from dataclasses import replace
 
-    from mpitled import predict
+    from mpitled.speed import predict
 
     counts, path = _numbers("--parts", options.parts), _model(options.model)
     cluster = predict.Cluster()
@@ -265,7 +266,7 @@ def _numbers(name: str, text: str) -> list[int]:
 
 
 def _stability(options: argparse.Namespace) -> int:
-    from mpitled import stability
+    from mpitled.batch import stability
 
     rows = stability.matrix(options.out, [name for name in options.only.split(",") if name])
     print(stability.summary(rows))

@@ -747,7 +747,7 @@ def _content(deck: Deck, names: Iterable[str], included: Sequence[Path], **more:
 def program() -> str:
     """This program by its sources: a model that others built may differ from what they would build."""
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
     return f"sha256:{digest.hexdigest()}"
 

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from mpitled import store
 from mpitled.deck import GEOMETRIES
 from mpitled.errors import InputError
-from mpitled.meshfile import LARGEST_ID
 from mpitled.model import Model
+from mpitled.readers.meshfile import LARGEST_ID
 
 FE, EFG, GRID, AREAS, SCENE = "fe.inp", "efg.inp", "integration_points.csv", "surface_areas.csv", "scene.toml"
 #: Sections that the export writes anew: constraints are in the files, and materials go by sets that there are.

@@ -140,7 +140,7 @@ def _asked(ask: Callable[[], str | None]) -> str | None:
 
 
 def _mpi() -> str:
-    from mpitled.halo import library_version
+    from mpitled.solver.halo import library_version
 
     return library_version()
 

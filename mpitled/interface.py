@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled import preprocess, store
-from mpitled import run as runs
-from mpitled.cases import read as read_sweep
+from mpitled.batch.cases import read as read_sweep
+from mpitled.batch.summary import collect, records
 from mpitled.deck import Deck, load_deck
 from mpitled.errors import InputError
-from mpitled.halo import World
 from mpitled.model import Model
-from mpitled.summary import collect, records
+from mpitled.solver import run as runs
+from mpitled.solver.halo import World
 
 __all__ = ["Frames", "RunResult", "build_model", "load_deck", "open_result", "open_sweep", "run_deck"]
 

@@ -7,14 +7,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import block, checks, hexahedra, labels, phantoms, support
 from mpitled.deck import Deck
 from mpitled.errors import InputError
 from mpitled.loading import growth, turn
-from mpitled.mapping import carry_over
 from mpitled.material import Material
 from mpitled.mesh import Mesh, named_set
+from mpitled.meshing import block, checks, labels, phantoms
+from mpitled.meshing.mapping import carry_over
 from mpitled.model import Model
+from mpitled.solver import hexahedra, support
 
 #: The node set of a seed's surface, which the meshers make where there is a tumour.
 TUMOUR = "tumour"
@@ -50,7 +51,7 @@ def _geometry(deck: Deck) -> Mesh:
     if deck.ellipsoid:
         return phantoms.ellipsoid_mesh(deck.ellipsoid, deck.cloud, deck.tumour)
     assert deck.mesh is not None  # load_deck sees to exactly one geometry
-    from mpitled import meshes
+    from mpitled.readers import meshes
 
     seed_volume = 4 / 3 * np.pi * deck.tumour.seed_radius**3 if deck.tumour else 0.0
     return meshes.read_mesh(deck.mesh, seed_volume)

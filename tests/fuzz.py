@@ -19,8 +19,8 @@ from pathlib import Path
 
 from decks import KINDS, void_decks
 
-from mpitled import overview
 from mpitled.errors import InputError
+from mpitled.speed import overview
 
 LIMIT_S, LIMIT_BYTES = 5, 2 << 30
 _NASTY = [

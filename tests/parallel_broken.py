@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from mpitled import cli
-from mpitled import run as runs
 from mpitled.errors import UnstableError
-from mpitled.halo import World
+from mpitled.solver import run as runs
+from mpitled.solver.halo import World
 
 BREAKS, AT = 2, 0.3  # the rank that does, and the share of the load at which
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mpitled import run as runs
 from mpitled.deck import load_deck
-from mpitled.halo import World
+from mpitled.solver import run as runs
+from mpitled.solver.halo import World
 
 
 def main(deck: Path, directory: Path) -> None:

@@ -11,11 +11,12 @@ from decks import ASSEMBLY, CLOUD, FLAT, INCLUDED, INCLUDING
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mpitled import meshes, overview
 from mpitled.deck import MeshFiles
 from mpitled.errors import InputError
 from mpitled.mesh import grid_points, structured_hexahedra
-from mpitled.meshfile import MeshFile, exterior_faces
+from mpitled.readers import meshes
+from mpitled.readers.meshfile import MeshFile, exterior_faces
+from mpitled.speed import overview
 
 
 def read(folder: Path, text: str | bytes, name: str = "deck.inp") -> MeshFile:

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from conftest import complaint, mpitled, ranks
 
-from mpitled import bench, cli, limits, omissions
-from mpitled.flops import Counting, of_terms
+from mpitled import cli
+from mpitled.speed import bench, limits, omissions
+from mpitled.speed.flops import Counting, of_terms
 
 CASE = {"scene", "cells", "precision", "ranks", "million_cell_updates_per_second_per_core", "bytes_per_cell",
         "halo_share", "roofline_share"}  # fmt: skip

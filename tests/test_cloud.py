@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from mpitled import deck
-from mpitled.block import block_mesh
-from mpitled.cloud import CLOSEST, Spacing, boundary_faces, cut, fill_void, subdivide, volumes_and_centroids
 from mpitled.errors import InputError
 from mpitled.mesh import grid_points, structured_hexahedra
+from mpitled.meshing.block import block_mesh
+from mpitled.meshing.cloud import CLOSEST, Spacing, boundary_faces, cut, fill_void, subdivide, volumes_and_centroids
 
 CLOUD = deck.Cloud(points_per_spacing=1.4, growth=0.3)
 SEED_VOLUME = 4 / 3 * np.pi * 0.002**3

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from conftest import ROOT, complaint, mpitled
 
-from mpitled import compare, deck, field, preprocess, store
+from mpitled import deck, preprocess, store
 from mpitled.errors import InputError
+from mpitled.results import compare, field
 
 DATA, VALIDATION = Path(__file__).with_name("data"), ROOT / "jobs" / "validation"
 MATERIAL = "[material.brain]\nyoungs_modulus = 3000.0\npoissons_ratio = 0.49\n"

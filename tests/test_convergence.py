@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 from conftest import ROOT, mpitled
 
-from mpitled import compare, preprocess, store
+from mpitled import preprocess, store
 from mpitled.deck import load_deck
-from mpitled.halo import World
-from mpitled.relaxation import Relaxation
-from mpitled.subdomain import localise
+from mpitled.results import compare
+from mpitled.solver.halo import World
+from mpitled.solver.relaxation import Relaxation
+from mpitled.solver.subdomain import localise
 
 SIZE = 0.06  # m
 BLOCK = """

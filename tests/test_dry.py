@@ -9,10 +9,10 @@ import pytest
 from conftest import mpitled
 
 from mpitled.deck import load_deck
-from mpitled.dry import reasons
-from mpitled.halo import World
-from mpitled.run import prepare
-from mpitled.witness import kernel_names
+from mpitled.solver.halo import World
+from mpitled.solver.run import prepare
+from mpitled.speed.dry import reasons
+from mpitled.speed.witness import kernel_names
 
 SCENE = """
 [block]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mpitled import run
 from mpitled.deck import load_deck
-from mpitled.halo import World
+from mpitled.solver import run
+from mpitled.solver.halo import World
 from mpitled.store import open_result
 
 BRAIN = """

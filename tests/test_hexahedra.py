@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_kernels import box
 
-from mpitled.hexahedra import (
+from mpitled.mesh import CORNERS, grid_points, structured_hexahedra
+from mpitled.solver.hexahedra import (
     FLAT,
     HOURGLASS_MODES,
     aspect,
@@ -21,7 +22,6 @@ from mpitled.hexahedra import (
     scaled_jacobian,
     volumes,
 )
-from mpitled.mesh import CORNERS, grid_points, structured_hexahedra
 
 CUBE = (CORNERS + 1) / 2
 ONE = np.arange(8)[None]

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
-from mpitled import hexahedra, kernels
 from mpitled.material import Material, first_piola, strain_energy
 from mpitled.mesh import CORNERS, grid_points, structured_hexahedra
-from mpitled.step import State, at_rest, compose_forces, compose_march
+from mpitled.solver import hexahedra, kernels
+from mpitled.solver.step import State, at_rest, compose_forces, compose_march
+from mpitled.solver.subdomain import localise
+from mpitled.solver.survey import Survey
 from mpitled.store import PartRows
-from mpitled.subdomain import localise
-from mpitled.survey import Survey
 
 BRAIN = Material("brain", 3000.0, 0.49, 1000.0)
 SOFT = Material("soft", 10.0, 0.1, 1000.0)

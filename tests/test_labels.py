@@ -10,9 +10,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from mpitled import deck
-from mpitled.cloud import FACES, boundary_faces
 from mpitled.errors import InputError
-from mpitled.labels import mesh_labels, solid_cells
+from mpitled.meshing.cloud import FACES, boundary_faces
+from mpitled.meshing.labels import mesh_labels, solid_cells
 
 nibabel = pytest.importorskip("nibabel")
 

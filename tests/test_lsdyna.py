@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from test_abaqus import assert_same, ids_of
 from test_abaqus import read as read_named
 
-from mpitled import meshes
 from mpitled.deck import MeshFiles
 from mpitled.errors import InputError
 from mpitled.mesh import grid_points, structured_hexahedra
-from mpitled.meshfile import MeshFile
+from mpitled.readers import meshes
+from mpitled.readers.meshfile import MeshFile
 
 
 def read(folder: Path, text: str, name: str = "deck.k") -> MeshFile:

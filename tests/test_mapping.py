@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from mpitled import deck, mapping, preprocess
-from mpitled.cloud import on_sphere
+from mpitled import deck, preprocess
 from mpitled.errors import InputError
+from mpitled.meshing import mapping
+from mpitled.meshing.cloud import on_sphere
 
 SCENE = """
 [ellipsoid]

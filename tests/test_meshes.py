@@ -15,11 +15,14 @@ from conftest import complaint, mpitled
 from decks import CLOUD, FLAT, void_decks
 from fuzz import fuzz
 
-from mpitled import hexahedra, meshes, overview, store, tables
+from mpitled import store
 from mpitled.deck import MeshFiles, load_deck
 from mpitled.errors import InputError
 from mpitled.mesh import Mesh, grid_points, structured_hexahedra
 from mpitled.preprocess import build
+from mpitled.readers import meshes, tables
+from mpitled.solver import hexahedra
+from mpitled.speed import overview
 
 GROWTH = """
 title = "a tumour in a block"

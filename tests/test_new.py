@@ -8,10 +8,11 @@ import re
 import pytest
 from conftest import ROOT, complaint, mpitled
 
-from mpitled import overview, scaffold
+from mpitled import scaffold
 from mpitled.arguments import KINDS
 from mpitled.deck import canonical, load_deck
 from mpitled.errors import InputError
+from mpitled.speed import overview
 
 
 @pytest.mark.parametrize("kind", KINDS)

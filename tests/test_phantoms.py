@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from mpitled import deck, hexahedra, kernels, loading, onion, preprocess, support
-from mpitled.block import block_mesh
-from mpitled.cloud import boundary_faces
+from mpitled import deck, loading, preprocess
 from mpitled.errors import InputError
 from mpitled.mesh import Rotation
-from mpitled.phantoms import cylinder_mesh, ellipsoid_mesh
+from mpitled.meshing import onion
+from mpitled.meshing.block import block_mesh
+from mpitled.meshing.cloud import boundary_faces
+from mpitled.meshing.phantoms import cylinder_mesh, ellipsoid_mesh
+from mpitled.solver import hexahedra, kernels, support
 
 CLOUD = deck.Cloud()
 TUMOUR = deck.Tumour(centre=(0.015, 0.0, 0.008), volume=523.6e-9)

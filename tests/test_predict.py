@@ -10,7 +10,7 @@ from conftest import complaint, mpitled
 
 import partition
 from mpitled.mesh import structured_hexahedra
-from mpitled.predict import COLUMNS, Cluster, step_time
+from mpitled.speed.predict import COLUMNS, Cluster, step_time
 
 SCENE = """
 [block]

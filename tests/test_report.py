@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 from conftest import complaint, mpitled
 
-from mpitled import hexahedra, info, report, store
-from mpitled.cloud import boundary_faces, fill_void, interface_faces
+from mpitled import info, store
 from mpitled.deck import Cloud, load_deck
 from mpitled.mesh import grid_points, structured_hexahedra
+from mpitled.meshing.cloud import boundary_faces, fill_void, interface_faces
 from mpitled.preprocess import build
+from mpitled.results import report
+from mpitled.solver import hexahedra
 
 GROWTH = """
 title = "a tumour in a block"
@@ -276,7 +278,7 @@ def test_report_goes_on_without_matplotlib(grown, monkeypatch):
 
 def test_cuts_are_exact():
     """A slanted plane through a cube, x + y + z = 1.2: the area is closed, and linear values are met."""
-    plot = pytest.importorskip("mpitled.plot")
+    plot = pytest.importorskip("mpitled.results.plot")
     points, cells = grid_points((3, 3, 3), (1.0, 1.0, 1.0)), structured_hexahedra((3, 3, 3))
     vertices = np.concatenate([points, points[cells].mean(axis=1)])
     triangles = plot._triangles(cells[:, plot.FACES].reshape(-1, 4))
@@ -290,7 +292,7 @@ def test_cuts_are_exact():
 
 def test_the_cloud_is_drawn_without_holes(tmp_path):
     """Random places of the cloud in a plane through the middle: each is in a piece of the cut."""
-    plot = pytest.importorskip("mpitled.plot")
+    plot = pytest.importorskip("mpitled.results.plot")
     model = model_of(tmp_path, GROWTH, elements="12, 10, 10", cloud="core")
     solid = plot._solid(model, np.zeros_like(model.points))
     height = solid.points[:, 0] - 25.0  # between the hexahedra's layers

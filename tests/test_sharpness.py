@@ -9,10 +9,10 @@ import pytest
 
 from mpitled import preprocess, store
 from mpitled.deck import load_deck, model_key
-from mpitled.halo import World
-from mpitled.march import March
-from mpitled.relaxation import Relaxation
-from mpitled.subdomain import localise
+from mpitled.solver.halo import World
+from mpitled.solver.march import March
+from mpitled.solver.relaxation import Relaxation
+from mpitled.solver.subdomain import localise
 
 TISSUE = """
 [material.tissue]

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from conftest import ROOT, complaint, mpitled
 
-from mpitled import extremes, hexahedra, meshes, stability
+from mpitled.batch import extremes, stability
+from mpitled.batch.exact import shell
 from mpitled.deck import MeshFiles
-from mpitled.exact import shell
 from mpitled.material import Material
 from mpitled.model import Model
+from mpitled.readers import meshes
+from mpitled.solver import hexahedra
 
 FEW = extremes.AXES["few"]
 

@@ -19,7 +19,7 @@ MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob
 #: Libraries that one module alone may import, at its head or inside of a function.
 OWNERS = {
     "h5py": {"mpitled.store"},
-    "mpi4py": {"mpitled.halo"},
+    "mpi4py": {"mpitled.solver.halo"},
     "pymetis": {"partition.metis"},
     "pyvista": {"mpitled.interface"},
     "xarray": {"mpitled.interface"},

@@ -7,13 +7,13 @@ import pytest
 from scipy.spatial import cKDTree
 from test_kernels import HOURGLASS, at, forces, part
 
-from mpitled import hexahedra
 from mpitled.deck import load_deck
 from mpitled.errors import InputError
 from mpitled.mesh import CORNERS
 from mpitled.preprocess import build
-from mpitled.subdomain import localise
-from mpitled.support import (
+from mpitled.solver import hexahedra
+from mpitled.solver.subdomain import localise
+from mpitled.solver.support import (
     FLATTEST,
     POWERS,
     field_at_nodes,

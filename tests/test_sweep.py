@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 from conftest import ENVIRONMENT, ROOT, mpitled
 
-from mpitled import cases, open_sweep, screen, summary, vary
+from mpitled import open_sweep
+from mpitled.batch import cases, screen, summary, vary
 from mpitled.errors import InputError
 
 CUBE = ROOT / "jobs" / "validation" / "cube.toml"

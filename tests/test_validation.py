@@ -10,7 +10,7 @@ import pytest
 from conftest import ROOT
 from test_compare import CYLINDER, SLOPE, synthetic
 
-from mpitled import charts
+from mpitled.results import charts
 
 
 @pytest.fixture(scope="module")

@@ -32,12 +32,13 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mpitled import compare, field, preprocess
-from mpitled import run as runs
+from mpitled import preprocess
 from mpitled.deck import Deck, load_deck
-from mpitled.halo import World
 from mpitled.loading import sphere_radius
 from mpitled.mesh import CORNERS, Mesh
+from mpitled.results import compare, field
+from mpitled.solver import run as runs
+from mpitled.solver.halo import World
 
 ROOT = Path(__file__).resolve().parents[2]
 OUT = Path("out/implicit")
@@ -136,7 +137,7 @@ def main() -> None:
 
 def _tell(found: dict[tuple[str, str, tuple[str, ...]], list[dict[str, Any]]]) -> None:
     """The table and the figure of the medians of what has been measured, under scene, family and mesh."""
-    from mpitled import charts  # not for the runs
+    from mpitled.results import charts  # not for the runs
 
     rows = [
         {"scene": name, "family": family, "mesh": " ".join(mesh)} | _median(measured)

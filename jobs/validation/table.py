@@ -19,7 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from mpitled import charts, compare, field, hexahedra, launch
+from mpitled.batch import launch
+from mpitled.results import charts, compare, field
+from mpitled.solver import hexahedra
 
 HERE = Path(__file__).parent
 REFERENCES, STUDIES = HERE.parents[1] / "tests" / "data", HERE.parent / "studies"

@@ -1,0 +1,132 @@
+"""The cases of a sweep: the deck with other values of some keys in each, a folder for each, and a manifest of them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mpitled import atomic
+from mpitled import deck as decks
+from mpitled.batch import launch, vary
+from mpitled.deck import Deck
+from mpitled.errors import InputError
+from mpitled.loading import sphere_radius
+from mpitled.solver.run import included
+
+MANIFEST = "sweep.json"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Case:
+    """One run of a sweep."""
+
+    number: int  # from 1
+    values: vary.Values  # of the varied keys
+    overrides: tuple[str, ...]
+    deck: Deck
+    folder: Path
+    model: Path  # folder for the model, if several cases have the same one
+    shares: bool  # whether they do
+
+    @property
+    def words(self) -> str:
+        """What it is, for messages."""
+        return " ".join(f"{key}={value}" for key, value in self.values.items())
+
+    @property
+    def failure(self) -> str | None:
+        """None if it did not end yet, "" if it is done, or why it is broken."""
+        return launch.outcome(self.folder)
+
+    @property
+    def work(self) -> float:
+        """Time that it takes, in unknown units: good enough to tell long cases of one deck from short ones."""
+        deck, solver = self.deck, self.deck.solver
+        sized = deck.labels or deck.cylinder or deck.ellipsoid
+        edge = sized.element_size if sized else 1.0
+        cells = edge**-3
+        if deck.block:
+            cells = math.prod(deck.block.elements)
+            edge = max(length / n for length, n in zip(deck.block.size, deck.block.elements, strict=True))
+        speed = max((section.material.wave_speed for section in deck.materials), default=1.0)
+        steps = (solver.load_time + solver.hold_time) * speed / edge
+        if solver.method == "dynamic-relaxation":
+            steps = solver.load_steps
+        # What grows more is stiffer next to the tumour, and takes longer.
+        growth = sphere_radius(deck.tumour.volume) / deck.tumour.seed_radius if deck.tumour else 1.0
+        return cells * steps * (1 + growth)
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """All cases of a deck in a folder."""
+
+    deck: Path
+    base: tuple[str, ...]  # overrides for all
+    ranks: int  # of each case
+    folder: Path
+    cases: tuple[Case, ...]
+
+    @property
+    def keys(self) -> list[str]:
+        """The varied keys."""
+        return list(dict.fromkeys(key for case in self.cases for key in case.values))
+
+    def write_manifest(self) -> None:
+        """What `read` takes: a sweep goes on by its folder alone, from anywhere."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        cases = [{"number": c.number, "folder": c.folder.name, "values": c.values} for c in self.cases]
+        manifest = {"deck": str(self.deck.resolve()), "overrides": self.base, "ranks": self.ranks, "cases": cases}
+        atomic.write_text(self.folder / MANIFEST, json.dumps(manifest, indent=2) + "\n")
+
+
+def plan(deck: Path, values: Sequence[vary.Values], base: Sequence[str], ranks: int, folder: Path) -> Sweep:
+    """The sweep of a deck over values of keys.
+
+    InputError for what a deck does not take, before anything runs, and for a case that is there twice.
+    """
+    scenes = []
+    for given in values:
+        overrides = vary.overrides(base, given)
+        scene = decks.load_deck(deck, overrides)
+        files = included(scene)
+        scenes.append((given, overrides, scene, decks.scene_key(scene, files), decks.model_key(scene, files)))
+    numbers: dict[str, int] = {}
+    for number, (_, _, _, key, _) in enumerate(scenes, 1):
+        if (first := numbers.setdefault(key, number)) != number:
+            raise InputError(f"{deck}: cases {first} and {number} are the same; leave one out")
+    models = [model for *_, model in scenes]
+    cases = []
+    for number, (given, overrides, scene, key, model) in enumerate(scenes, 1):
+        words = " ".join(f"{name}-{value}" for name, value in given.items())
+        name = hashlib.sha256(model.encode()).hexdigest()[:16]
+        cases.append(
+            Case(
+                number, given, overrides, scene, folder / vary.folder(words, f"{ranks} {key}"),
+                folder / "models" / name, models.count(model) > 1,
+            )
+        )  # fmt: skip
+    return Sweep(deck, tuple(base), ranks, folder, tuple(cases))
+
+
+def is_sweep(folder: Path) -> bool:
+    """Whether a folder is that of a sweep."""
+    return (folder / MANIFEST).is_file()
+
+
+def read(folder: Path) -> Sweep:
+    """The sweep that was begun in a folder."""
+    path = folder / MANIFEST
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+        values = [case["values"] for case in manifest["cases"]]
+        deck, base, ranks = Path(manifest["deck"]), manifest["overrides"], manifest["ranks"]
+    except FileNotFoundError:
+        raise InputError(f"{folder}: holds no sweep; give a deck, or the folder that 'mpitled sweep' wrote") from None
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{path}: cannot be read; give the deck again with --vary or --cases") from None
+    return plan(deck, values, base, ranks, folder)

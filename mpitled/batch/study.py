@@ -1,0 +1,133 @@
+"""The study of a scene: error against run time over the keys that trade one for the other, a process for each run."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mpitled import atomic
+from mpitled.batch import launch
+from mpitled.batch import vary as families
+from mpitled.deck import load_deck
+from mpitled.errors import InputError
+from mpitled.results import compare
+
+COLUMNS = (
+    "family", "value", "ranks", "max_error_mm", "rms_error_mm", "static_distance_mm", "loop_s", "whole_s", "steps",
+    "cells", "cell_updates", "pareto", "failure",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """One run: the deck with the overrides of one value of a family, on so many ranks."""
+
+    family: str  # the varied key, or "as it is"
+    value: str
+    overrides: tuple[str, ...]
+    ranks: int
+
+    @property
+    def folder(self) -> str:
+        """A name that no other variant has, and that a person can read."""
+        return families.folder(f"{self.family}-{self.value}", json.dumps([self.overrides, self.ranks]))
+
+
+def variants(vary: Sequence[str], base: Sequence[str]) -> Iterator[Variant]:
+    """The scene as it is, then each family in turn (see `vary.family`); the key "ranks" is the number of ranks."""
+    yield Variant("as it is", "", tuple(base), 1)
+    for text in vary:
+        for values in families.family(text):
+            ranks = values.get("ranks", "1")
+            if not ranks.isdecimal() or int(ranks) < 1:
+                raise InputError(f"--vary {text}: ranks = {ranks}: is not a number of ranks; give 1 or more")
+            keys = {key: value for key, value in values.items() if key != "ranks"}
+            yield Variant("+".join(values), " ".join(values.values()), families.overrides(base, keys), int(ranks))
+
+
+def study(
+    deck: Path, reference: Path | None, vary: Sequence[str], base: Sequence[str], out: Path, beyond: float | None
+) -> list[dict[str, Any]]:
+    """Run what has not been run yet, one after the other, and tell what all of them gave: study.csv and study.png.
+
+    Errors (mm) are against the reference beyond so far (m) from edges, or, without one, the run's own estimate.
+    InputError for keys and values that the deck does not take, before anything runs.
+    """
+    todo = list(variants(vary, base))
+    for variant in todo:
+        load_deck(deck, variant.overrides)
+    out.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for i, variant in enumerate(todo, 1):
+        folder = out / variant.folder
+        if (failure := launch.outcome(folder)) is None:
+            print(f"{i}/{len(todo)}: {variant.family} {variant.value}", file=sys.stderr, flush=True)
+            failure = launch.run_apart(deck, variant.overrides, variant.ranks, folder)
+        rows.append(_row(variant, failure, folder, reference, beyond))
+    for row in rows:
+        row["pareto"] = _is_best(row, rows)
+    atomic.write_csv(out / "study.csv", COLUMNS, rows)
+    try:
+        from mpitled.results import charts
+    except ImportError:
+        print(f"{out}: no picture, for matplotlib is missing", file=sys.stderr)
+    else:
+        charts.draw_study(rows, out / "study.png", "largest error, mm" if reference else "estimated error, mm")
+    return rows
+
+
+def _row(variant: Variant, failure: str, folder: Path, reference: Path | None, beyond: float | None) -> dict[str, Any]:
+    row: dict[str, Any] = dict.fromkeys(COLUMNS, "")
+    row |= {"family": variant.family, "value": variant.value, "ranks": variant.ranks, "failure": failure}
+    if failure:
+        return row
+    report = json.loads((folder / "report.json").read_text())
+    cells = sum(report["cells"].values())
+    row |= {
+        "static_distance_mm": report.get("static_distance_mm", ""),
+        "loop_s": report["seconds"]["loop"],
+        "whole_s": sum(report["seconds"].values()),
+        "steps": report["steps"],
+        "cells": cells,
+        "cell_updates": cells * report["steps"],
+    }
+    if reference is None:
+        row["max_error_mm"] = row["static_distance_mm"]
+    else:
+        groups = compare.compare(folder, reference, beyond)["groups"]
+        found = groups["free beyond" if beyond is not None else "free"]
+        row |= {"max_error_mm": found["largest_mm"][-1], "rms_error_mm": found["rms_mm"][-1]}
+    return row
+
+
+def _is_best(row: dict[str, Any], rows: list[dict[str, Any]]) -> bool:
+    """Whether no other run is both more accurate and faster (Pareto)."""
+    if row["max_error_mm"] == "":
+        return False
+    others = (other for other in rows if other is not row and other["max_error_mm"] != "")
+    return not any(
+        other["max_error_mm"] <= row["max_error_mm"]
+        and other["loop_s"] <= row["loop_s"]
+        and (other["max_error_mm"], other["loop_s"]) != (row["max_error_mm"], row["loop_s"])
+        for other in others
+    )
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """The runs as lines for the terminal, a star for those that none beats in both error and time."""
+    lines = [f"{'':2}{'family':34}{'value':24}{'error, mm':>11}{'rms, mm':>10}{'loop, s':>9}{'steps':>8}{'cells':>9}"]
+    for row in rows:
+        if row["failure"]:
+            lines.append(f"  {row['family']:34}{row['value']:24}  {row['failure'][:90]}")
+            continue
+        numbers = "".join(
+            f"{row[name]:{width}.{digits}g}" if row[name] != "" else " " * width
+            for name, width, digits in (("max_error_mm", 11, 3), ("rms_error_mm", 10, 3), ("loop_s", 9, 3))
+        )
+        star = "*" if row["pareto"] else ""
+        lines.append(f"{star:2}{row['family']:34}{row['value']:24}{numbers}{row['steps']:8}{row['cells']:9}")
+    return "\n".join(lines)

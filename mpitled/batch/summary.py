@@ -1,0 +1,278 @@
+"""The table of a sweep: a row for each case, as CSV, HDF5, Markdown and HTML, with the charts of it."""
+
+from __future__ import annotations
+
+import csv
+import html
+import json
+import math
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mpitled import atomic, store
+from mpitled.batch import launch
+from mpitled.batch.cases import Sweep
+from mpitled.deck import unit_of
+from mpitled.errors import InputError
+
+Row = dict[str, float | str]
+
+
+class _Column(NamedTuple):
+    """A figure of report.json in the table."""
+
+    name: str
+    key: str  # in the report, parts joined by "."
+    heading: str  # with its unit
+    form: str  # in the rendered table
+
+
+COLUMNS = (
+    _Column("left_ml", "ventricle_volume_change_ml.left", "left ventricle, ml", "{:+.3f}"),
+    _Column("right_ml", "ventricle_volume_change_ml.right", "right ventricle, ml", "{:+.3f}"),
+    _Column("total_ml", "ventricle_volume_change_ml.total", "ventricles, ml", "{:+.3f}"),
+    _Column("max_displacement_mm", "max_displacement_mm", "largest displacement, mm", "{:.2f}"),
+    _Column("share_over_5mm_nodes", "share_over_5mm.nodes", "over 5 mm, share of nodes", "{:.2%}"),
+    _Column("share_over_5mm_volume", "share_over_5mm.volume", "over 5 mm, share of volume", "{:.2%}"),
+    _Column("min_jacobian", "min_jacobian", "smallest J", "{:.3f}"),
+    _Column("error_estimate_mm", "static_distance_mm", "error estimate, mm", "{:.4f}"),
+    _Column("volume_balance_error", "volume_balance.relative_error", "volume balance, error", "{:.2%}"),
+    _Column("steps", "steps", "steps", "{:.0f}"),
+    _Column("hexahedra", "cells.hexahedra", "hexahedra", "{:.0f}"),
+    _Column("support_domains", "cells.support_domains", "support domains", "{:.0f}"),
+)
+#: In a file of their own, for they are never the same twice.
+TIMES = (
+    _Column("loop_s", "seconds.loop", "loop, s", "{:.1f}"),
+    _Column("whole_s", "seconds", "run time, s", "{:.1f}"),
+)
+#: Numbers of the mesh are for the files, not for people.
+_RENDERED = (*COLUMNS[:-3], TIMES[-1])
+
+
+class Table(NamedTuple):
+    """The cases that ended, and those that others have of them; numbers, or text where there is none ("")."""
+
+    keys: list[str]  # varied ones
+    rows: list[Row]  # case, keys, `COLUMNS`, failure, for each case of the sweep
+    times: list[Row]  # case, `TIMES`
+    beside: dict[int, Row]  # by case
+    beside_name: str
+
+
+def collect(sweep: Sweep, beside: Path | None = None) -> Table:
+    """What the cases gave, done, broken or not computed. `beside`: a CSV of the varied keys and columns of ours."""
+    rows, times = [], []
+    for case in sweep.cases:
+        failure = case.failure
+        found: dict[str, Any] = {}
+        if failure == "":
+            try:
+                found = json.loads((case.folder / "report.json").read_text(encoding="utf-8"))
+            except (OSError, ValueError) as error:
+                raise InputError(
+                    f"{case.folder}: has no report ({error}); remove the folder, and sweep again"
+                ) from None
+        given: Row = {"case": case.number} | {key: _number(case.values.get(key, "")) for key in sweep.keys}
+        figures: Row = {column.name: _figure(found, column.key) for column in COLUMNS}
+        rows.append(given | figures | {"failure": "not computed" if failure is None else failure})
+        times.append({"case": case.number} | {column.name: _figure(found, column.key) for column in TIMES})
+    name = beside.stem.replace("_", " ") if beside else ""
+    return Table(sweep.keys, rows, times, _read_beside(beside, sweep.keys, rows) if beside else {}, name)
+
+
+def write(sweep: Sweep, table: Table) -> list[Path]:
+    """Write table.csv, times.csv, table.h5, table.md, table.html and the charts into the sweep's folder."""
+    folder = sweep.folder
+    paths = [folder / name for name in ("table.csv", "times.csv", "table.h5", "table.md", "table.html")]
+    atomic.write_csv(paths[0], list(table.rows[0]), table.rows)
+    atomic.write_csv(paths[1], list(table.times[0]), table.times)
+    groups = {"table": table.rows, "times": table.times}
+    store.write_columns(paths[2], {name: _columns(rows) for name, rows in groups.items()})
+    atomic.write_text(paths[3], markdown(table))
+    charts = _draw(table, folder)
+    atomic.write_text(paths[4], _html(sweep, table, charts))
+    programs = {launch.about(case.folder).get("program") for case in sweep.cases if case.failure == ""}
+    if len(programs) > 1:
+        print(
+            f"note: {folder}: the cases are of {len(programs)} versions of the program; remove the older folders and "
+            "sweep again to have one",
+            file=sys.stderr,
+        )
+    return [*paths, *charts]
+
+
+def markdown(table: Table) -> str:
+    """The table for people, in Markdown: under each case's row the one of others, if they have it."""
+    headings, lines = _rendered(table)
+    text = [f"| {' | '.join(headings)} |", "|" + "---|" * len(headings)]
+    text += [f"| {' | '.join(cell.replace('|', '/') for cell in line)} |" for line in lines]
+    return "\n".join(text) + "\n"
+
+
+def text(table: Table) -> str:
+    """The table for a terminal."""
+    headings, lines = _rendered(table)
+    cells = [[*heading.split(", ")] for heading in headings]
+    depth = max(map(len, cells))
+    heads = [[(words + [""] * depth)[i] for words in cells] for i in range(depth)]
+    figures = [line for line in lines if not _is_remark(line)]
+    widths = [max(len(line[i]) for line in (*heads, *figures)) for i in range(len(headings))]
+    made = []
+    for line in (*heads, *lines):
+        shown = line if not _is_remark(line) else [cell for cell in line if cell]
+        made.append("  ".join(f"{cell:>{width}}" for cell, width in zip(shown, widths, strict=False)))
+    return "\n".join(made)
+
+
+def records(table: Table) -> list[dict[str, Any]]:
+    """The rows with their times, for JSON."""
+    return [
+        {name: None if value == "" and name != "failure" else value for name, value in (row | time).items()}
+        for row, time in zip(table.rows, table.times, strict=True)
+    ]
+
+
+# --- the numbers ---------------------------------------------------------------------------------------------------
+
+
+def _number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _figure(report: Any, key: str) -> float | str:
+    for part in key.split("."):
+        report = report.get(part) if isinstance(report, dict) else None
+    if isinstance(report, dict):  # phases, of which the whole is asked for
+        return float(sum(report.values()))
+    return "" if report is None else report
+
+
+def _read_beside(path: Path, keys: Sequence[str], rows: Sequence[Row]) -> dict[int, Row]:
+    """By case, the row with the same values of the varied keys."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            names, theirs = reader.fieldnames or [], list(reader)
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); give a CSV of {', '.join(keys)} and figures") from None
+    known = {column.name for column in COLUMNS}
+    if missing := [key for key in keys if key not in names]:
+        raise InputError(f"{path}: has no column {missing[0]}, by which its rows belong to cases")
+    if strange := [name for name in names if name not in (*keys, *known)]:
+        raise InputError(f"{path}: {strange[0]} is no column of the table; there are {', '.join(sorted(known))}")
+    found: dict[int, Row] = {}
+    for line, given in enumerate(theirs, 2):
+        their = {name: _number(given[name] or "") for name in names}
+        if wrong := [name for name in names if name in known and their[name] != "" and isinstance(their[name], str)]:
+            raise InputError(f"{path}: line {line}: {wrong[0]} = {their[wrong[0]]}: is not a number")
+        for row in rows:
+            if all(row[key] == their[key] for key in keys):
+                found[int(row["case"])] = their
+    return found
+
+
+def _columns(rows: Sequence[Row]) -> dict[str, list[float | str]]:
+    """Columns of numbers with nan where there is none; of text if there is a word in it, or for "failure"."""
+    columns: dict[str, list[float | str]] = {name: [row[name] for row in rows] for name in rows[0]}
+    for name, values in columns.items():
+        if name != "failure" and all(value == "" or not isinstance(value, str) for value in values):
+            columns[name] = [math.nan if value == "" else value for value in values]
+    return columns
+
+
+# --- what people see -----------------------------------------------------------------------------------------------
+
+
+def _rendered(table: Table) -> tuple[list[str], list[list[str]]]:
+    """Headings and lines of cells; of columns that no case has, none."""
+    columns = [c for c in _RENDERED if any((row | time)[c.name] != "" for row, time in _pairs(table))]
+    headings = [f"{key}, {unit}" if (unit := unit_of(key)) else key for key in table.keys]
+    headings += [*([""] if table.beside else []), *(column.heading for column in columns)]
+    lines = []
+    for row, time in _pairs(table):
+        values = [f"{row[key]:.10g}" if isinstance(row[key], float) else str(row[key]) for key in table.keys]
+        who = ["here"] if table.beside else []
+        if row["failure"]:
+            lines.append([*values, *([""] if who else []), str(row["failure"]), *[""] * (len(columns) - 1)])
+        else:
+            lines.append([*values, *who, *_cells(row | time, columns)])
+        if (their := table.beside.get(int(row["case"]))) is not None:
+            lines.append([*[""] * len(values), table.beside_name, *_cells(their, columns)])
+    return headings, lines
+
+
+def _is_remark(line: list[str]) -> bool:
+    return len(line) > 3 and not any(line[-3:])
+
+
+def _pairs(table: Table) -> Iterator[tuple[Row, Row]]:
+    return zip(table.rows, table.times, strict=True)
+
+
+def _cells(row: Row, columns: Sequence[_Column]) -> list[str]:
+    return [c.form.format(row[c.name]) if row.get(c.name, "") != "" else "" for c in columns]
+
+
+def _draw(table: Table, folder: Path) -> list[Path]:
+    """The charts: each quantity against the first varied key that is a number; error estimate against run time."""
+    try:
+        from mpitled.results import charts
+    except ImportError:
+        print(f"{folder}: no charts, for matplotlib is missing: pip install 'mpitled[pictures]'", file=sys.stderr)
+        return []
+    rows = [row | time for row, time in _pairs(table) if not row["failure"]]
+    made = []
+    numeric = [key for key in table.keys if len({row[key] for row in rows if not isinstance(row[key], str)}) > 1]
+    if numeric:
+        key = numeric[0]
+        others = [other for other in table.keys if other != key]
+        families: dict[str, list[Row]] = {}
+        for row in rows:
+            if not isinstance(row[key], str):
+                families.setdefault(" ".join(f"{other}={row[other]}" for other in others), []).append(row)
+        if table.beside:
+            families[table.beside_name] = list(table.beside.values())
+        quantities = {c.name: c.heading for c in COLUMNS[:8] if any(row[c.name] != "" for row in rows)}
+        label = f"{key}, {unit}" if (unit := unit_of(key)) else key
+        charts.draw_quantities(families, key, label, quantities, folder / "quantities.png")
+        made.append(folder / "quantities.png")
+    if timed := [row for row in rows if row["error_estimate_mm"] != ""]:
+        points = [(float(row["loop_s"]), float(row["error_estimate_mm"]), _label(row, table.keys)) for row in timed]
+        charts.draw_cost(points, folder / "cost.png")
+        made.append(folder / "cost.png")
+    return made
+
+
+def _label(row: Row, keys: Sequence[str]) -> str:
+    return " ".join(f"{row[key]:g}" if isinstance(row[key], float) else str(row[key]) for key in keys)
+
+
+_PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
+body {{ font-family: sans-serif; margin: 2em; color: #222 }}
+table {{ border-collapse: collapse }}
+th, td {{ padding: 0.3em 0.7em; text-align: right; border-bottom: 1px solid #ccc }}
+img {{ max-width: 100%; display: block; margin-top: 1.5em }}
+</style></head><body>
+<h1>{title}</h1>
+<table>
+{rows}
+</table>
+{images}
+</body></html>
+"""
+
+
+def _html(sweep: Sweep, table: Table, charts: Sequence[Path]) -> str:
+    headings, lines = _rendered(table)
+    rows = ["<tr>" + "".join(f"<th>{html.escape(cell)}</th>" for cell in headings) + "</tr>"]
+    rows += ["<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in line) + "</tr>" for line in lines]
+    images = [f'<img src="{path.name}" alt="{path.stem}">' for path in charts]
+    title = html.escape(sweep.cases[0].deck.title or sweep.deck.stem)
+    return _PAGE.format(title=title, rows="\n".join(rows), images="\n".join(images))

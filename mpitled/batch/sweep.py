@@ -1,0 +1,243 @@
+"""Computing the cases of a sweep, longest first: as processes, in groups of ranks, or as a scheduler's array job."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import secrets
+import shlex
+import shutil
+import signal
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import NoReturn
+
+from mpitled import deck as decks
+from mpitled import store
+from mpitled.batch import launch
+from mpitled.batch.cases import Case, Sweep, is_sweep
+from mpitled.batch.screen import Screen, share_done
+from mpitled.errors import InputError, InterruptedRun, MpitledError
+from mpitled.solver import run as runs
+from mpitled.solver.halo import World
+
+_WATCH = 0.2  # s between looks at what is at work
+
+
+def compute(sweep: Sweep, world: World, *, jobs: int = 1, retry: bool = False, only: int | None = None) -> None:
+    """Compute what is not done yet; an error in one case does not end the others. Broken cases only with `retry`.
+
+    On one rank `jobs` cases are at work at once, each on `sweep.ranks` ranks of its own. On many ranks groups of
+    `sweep.ranks` take the cases. `only` is the number of the one case to compute, as array jobs do.
+    InputError alike on all ranks if the numbers do not fit each other; InterruptedRun if it is ended from outside.
+    """
+    with runs.everywhere():
+        if world.size > 1 and world.size % sweep.ranks:
+            raise InputError(f"--ranks {sweep.ranks}: {world.size} ranks are no whole groups of it; start a multiple")
+        if only is not None and not 0 < only <= len(sweep.cases):
+            raise InputError(f"--only {only}: there are {len(sweep.cases)} cases; count them from 1")
+    cases = [case for case in sweep.cases if only is None or case.number == only]
+    with _alone(sweep, world, only):
+        token = world.broadcast(secrets.token_hex(4))
+        todo = runs.on_leader(world, lambda: [case.number for case in _to_do(cases, retry)])
+        todo = [case for case in cases if case.number in todo]
+        todo.sort(key=lambda case: -case.work)
+        first = {case.model: case for case in todo if case.shares and not _is_built(case, sweep.ranks)}
+        models = [] if only else list(first.values())
+        if world.size > 1:
+            _in_groups(sweep, models, todo, world, sweep.folder / f".claims-{token}")
+        else:
+            _as_processes(sweep, models, todo, jobs)
+
+
+def _to_do(cases: Sequence[Case], retry: bool) -> list[Case]:
+    """Cases that have not ended, or (retry) are broken: these are open again from now on."""
+    todo = [case for case in cases if case.failure is None or (retry and case.failure)]
+    for case in todo:
+        (case.folder / launch.DONE).unlink(missing_ok=True)
+    return todo
+
+
+def _is_built(case: Case, ranks: int) -> bool:
+    path = case.model / runs.MODEL
+    return path.exists() and store.has_partition(path, ranks)
+
+
+@contextmanager
+def _alone(sweep: Sweep, world: World, only: int | None) -> Iterator[None]:
+    """The folder for this sweep alone, if its file system has locks; tasks of an array job are at work together."""
+    held = []
+
+    def lock() -> None:
+        if only is not None and is_sweep(sweep.folder):
+            return  # other tasks read the manifest
+        sweep.write_manifest()
+        held.append((sweep.folder / ".lock").open("w"))
+        try:
+            fcntl.flock(held[0], fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"{sweep.folder}: another sweep is at work there; wait for its end") from None
+        except OSError:
+            pass
+        for stale in sweep.folder.glob(".claims-*"):
+            shutil.rmtree(stale, ignore_errors=True)
+
+    runs.on_leader(world, lock)
+    try:
+        yield
+    finally:
+        for file in held:
+            file.close()
+
+
+# --- on a workstation ----------------------------------------------------------------------------------------------
+
+
+def _as_processes(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], jobs: int) -> None:
+    """A process for each case, so many at once; first the models that several cases share."""
+    screen, working = Screen(), dict[Case, launch.Process]()
+    previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        for verb, cases in (("build", models), ("run", todo)):
+            waiting = list(cases)
+            while waiting or working:
+                while waiting and len(working) < jobs:
+                    case = waiting.pop(0)
+                    working[case] = _start(sweep, case, verb)
+                    if verb == "build":
+                        screen.tell(f"model of case {case.number} and others")
+                next(iter(working.values())).ended(_WATCH)
+                for case in [case for case, process in working.items() if process.ended(0)]:
+                    process = working.pop(case)
+                    if verb == "run":  # what a model lacks is said by the cases that cannot build it either
+                        _end(sweep, case, process.failure, screen)
+                shares = {case.words: share_done(launch.said(process.folder)) for case, process in working.items()}
+                screen.show(shares, len(waiting))
+    except KeyboardInterrupt:
+        done = sum(case.failure is not None for case in sweep.cases)
+        raise InterruptedRun(f"interrupted at {done} of {len(sweep.cases)} cases; the same command goes on") from None
+    finally:
+        for process in working.values():
+            process.stop()
+        signal.signal(signal.SIGTERM, previous)
+
+
+def _start(sweep: Sweep, case: Case, verb: str) -> launch.Process:
+    folder = case.folder if verb == "run" else case.model
+    launch.prepare(folder, case.model / runs.MODEL if verb == "run" and case.shares else None)
+    return launch.Process(launch.command(verb, sweep.deck, case.overrides, sweep.ranks, folder), folder)
+
+
+def _end(sweep: Sweep, case: Case, failure: str, screen: Screen) -> None:
+    launch.record(case.folder, failure, program=decks.program())
+    ended = f"{case.number}/{len(sweep.cases)} {case.words}: "
+    screen.tell(ended + (f"broken: {failure}" if failure else "done"), not failure)
+
+
+# --- in groups of ranks --------------------------------------------------------------------------------------------
+
+
+def _in_groups(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], world: World, claims: Path) -> None:
+    """Each group takes the first case in the queue that no other has taken, until there is none."""
+    group = world.split(sweep.ranks)
+    runs.on_leader(world, lambda: claims.mkdir())
+    for case in models:
+        if group.leads and _claim(claims / case.model.name):
+            _build(sweep, case)
+    world.barrier()
+    screen = Screen()
+    for case in todo:
+        if group.broadcast(group.leads and _claim(claims / case.folder.name)):
+            _run(sweep, case, group, screen, world)
+    world.barrier()
+    runs.on_leader(world, lambda: shutil.rmtree(claims, ignore_errors=True))
+
+
+def _claim(path: Path) -> bool:
+    """Whether this group is the first that asks; where ranks share a disc, they share this too."""
+    try:
+        os.close(os.open(path, os.O_CREAT | os.O_EXCL))
+    except FileExistsError:
+        return False
+    return True
+
+
+def _build(sweep: Sweep, case: Case) -> None:
+    """The model that several cases share; what it lacks is said by the cases that cannot build it either."""
+    try:
+        path, _ = runs.build(case.deck, case.model)
+        runs.ensure_partition(path, sweep.ranks, case.deck.partition.seed)
+    except Exception:
+        pass
+
+
+def _run(sweep: Sweep, case: Case, group: World, screen: Screen, world: World) -> None:
+    """Compute a case on a group's ranks; its error ends the case alone if all of the group know of it."""
+    if group.leads:
+        launch.prepare(case.folder, case.model / runs.MODEL if case.shares else None)
+    failure = ""
+    with _logged(case.folder / launch.LOG if group.leads else Path(os.devnull)):
+        try:
+            runs.run(case.deck, case.folder, group)
+        except InterruptedRun as error:
+            _abandon(world, error)
+        except Exception as error:
+            if not isinstance(error, MpitledError):
+                traceback.print_exc()
+            failure = str(error) or type(error).__name__
+            if group.size > 1 and not getattr(error, "everywhere", False):
+                # The others of the group wait for this rank, and nothing brings them back: the sweep has to go on anew.
+                launch.record(case.folder, f"rank {group.rank}: {failure}", program=decks.program())
+                _abandon(world, error)
+    if group.leads:
+        _end(sweep, case, failure, screen)
+
+
+def _abandon(world: World, error: Exception) -> NoReturn:
+    os.write(2, f"mpitled: {error}; the same command goes on with the other cases\n".encode())
+    world.abort(getattr(error, "status", 1))
+
+
+@contextmanager
+def _logged(path: Path) -> Iterator[None]:
+    with path.open("w") as log, redirect_stdout(log), redirect_stderr(log):
+        yield
+
+
+# --- as a scheduler's array job ------------------------------------------------------------------------------------
+
+
+def array_job(sweep: Sweep, scheduler: str) -> Path:
+    """A script that computes each case as a task of an array job of SLURM or PBS; time and queue are the user's."""
+    sweep.write_manifest()
+    n, ranks, folder = len(sweep.cases), sweep.ranks, sweep.folder.resolve()
+    words = f"mpitled sweep {shlex.quote(str(folder))} --only"
+    if scheduler == "slurm":
+        head = [
+            f"#SBATCH --array=1-{n}",
+            f"#SBATCH --ntasks={ranks}",
+            "#SBATCH --cpus-per-task=1",
+            "#SBATCH --time=01:00:00",
+            f"#SBATCH --output={folder}/slurm-%a.log",
+        ]
+        body = f'srun {words} "$SLURM_ARRAY_TASK_ID"'
+    else:
+        head = [f"#PBS -l select=1:ncpus={ranks}:mpiprocs={ranks}", "#PBS -l walltime=01:00:00", f"#PBS -o {folder}"]
+        head += [f"#PBS -J 1-{n}"] if n > 1 else []  # PBS refuses arrays of one
+        body = f'mpirun -n {ranks} {words} "${{PBS_ARRAY_INDEX:-1}}"'
+    script = [
+        "#!/usr/bin/env bash",
+        *head,
+        f"# {n} cases, each on {ranks} ranks; set the time that the longest takes, and your queue.",
+        f"# Afterwards: mpitled report {shlex.quote(str(folder))}",
+        "set -euo pipefail",
+        "export OMP_NUM_THREADS=1",
+        f"cd {shlex.quote(str(Path.cwd()))}",
+        body,
+    ]
+    path = sweep.folder / f"{scheduler}.sh"
+    path.write_text("\n".join(script) + "\n")
+    path.chmod(0o755)
+    return path

@@ -1,0 +1,121 @@
+"""Discs, balls and what is around a ball, cut in hexahedra: a square or cube-like core and shells."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpitled.mesh import grid_points, structured_hexahedra
+from mpitled.meshing.cloud import boundary_faces
+
+# Half the core's width over the radius, and how far the core's sides bulge towards the circle or sphere: from a search
+# for even cells whose worst corner is good (scaled Jacobian 0.85 in a cylinder, 0.71 in a ball; volumes 1 to 6 in it).
+_CORE, _BULGE = 0.5, 0.4
+
+
+class Onion:
+    """A disc or ball of radius 1 cut in a square or cube-like core and shells around it.
+
+    In the core, straight lines near the middle bend towards the sphere's outwards; between core and sphere, lines are
+    straight. Nodes are the core's grid, x fastest, then one shell after the other.
+    """
+
+    points: NDArray[np.float64]  # (n_nodes, d)
+    cells: NDArray[np.int64]  # (n_cells, 2^d), in VTK's order
+    surface: NDArray[np.int64]  # nodes on the sphere, ascending
+    cube: NDArray[np.float64]  # (n_surface, d), their places on the cube [-1, 1]^d before it was made round
+    faces: NDArray[np.int64]  # (n_faces, 2^(d-1)) rows of `surface`, seen from outside anticlockwise
+
+    def __init__(
+        self, shape: tuple[int, ...], radius: float, element_size: float, outermost: float = 1.0, lines: float = 1.0
+    ) -> None:
+        """Cells along each axis of the core; the shells are as thick as suits elements of that size (both m).
+
+        The outermost shell has the share `outermost` of their mean thickness. Across a ball's core, cells beside the
+        places 1/2 and 1 of the cube have the share `lines` of their mean width.
+        """
+        d = len(shape)
+        nx, ny, nz = (*shape, 1)[:3]
+        grid, core_cells = (
+            grid_points((nx, ny, nz), (2.0, 2.0, 2.0))[:, :d] - 1,
+            structured_hexahedra((nx, ny, nz)),
+        )
+        if d == 2:
+            grid, core_cells = grid[: len(grid) // 2], core_cells[:, :4]
+        # Whole numbers of cells, so that the faces' places are 1 and the patch's edge 1/2 without round-off.
+        grid = np.rint((grid + 1) / 2 * shape) * 2 / shape - 1
+        grid = _crowded(grid, lines)
+        level = np.abs(grid).max(axis=1)
+        edge = np.flatnonzero(level == 1)
+        self.cube = grid[edge]
+        direction = grid / np.where(level > 0, level, 1)[:, None]
+        bulge = _BULGE * level[:, None]
+        core = _CORE * level[:, None] * ((1 - bulge) * direction + bulge * on_sphere(direction))
+        inner, outer = core[edge], on_sphere(self.cube)
+        thickness = radius * (1 - np.linalg.norm(inner, axis=1).mean())
+        self.n_shells = number(thickness / element_size)
+        ends = graded(self.n_shells, outermost)
+        share = ends[1:, None, None]
+        self.points = np.concatenate([core, ((1 - share) * inner + share * outer).reshape(-1, d)])
+
+        row = np.full(len(grid), -1)
+        row[edge] = np.arange(len(edge))
+        self.faces = row[boundary_faces(core_cells) if d == 3 else _sides(core_cells)]
+        # Rows of the core's surface and of each shell.
+        nodes = np.concatenate([edge[None], len(grid) + np.arange(self.n_shells * len(edge)).reshape(-1, len(edge))])
+        self.surface = nodes[-1]
+        bottom, top = nodes[:-1][:, self.faces], nodes[1:][:, self.faces]
+        shells = np.concatenate([bottom if d == 3 else bottom[..., ::-1], top], axis=2).reshape(-1, 2**d)
+        self.cells = np.concatenate([core_cells, shells])
+        middle = np.abs(grid[core_cells].mean(axis=1)).max(axis=1)
+        shell = np.repeat((ends[1:] + ends[:-1]) / 2, len(self.faces))
+        self._radius = np.concatenate([_CORE * middle, _CORE + (1 - _CORE) * shell])
+        self._outermost = np.arange(len(self.cells)) >= len(self.cells) - len(self.faces)
+
+    def core(self, share: float) -> NDArray[np.bool_]:
+        """Cells (n_cells,) whose middle lies within that share of the radius, never those of the outermost shell."""
+        return (self._radius <= share) & ~self._outermost
+
+
+def graded(n: int, smallest: float, both_ends: bool = False) -> NDArray[np.float64]:
+    """Ends (n + 1,) of n parts of [0, 1], whose lengths fall evenly to `smallest` of their mean at 1, or at both ends.
+
+    They are a smooth map's, so that errors fall with n as those of equal parts do.
+    """
+    s, cycles = np.arange(n + 1) / n, 2 if both_ends else 1
+    away = (1 - smallest) * np.sin(cycles * np.pi * s) / (cycles * np.pi)
+    ends: NDArray[np.float64] = s - away if both_ends else s + away
+    ends[-1] = 1.0
+    return ends
+
+
+def _crowded(grid: NDArray[np.float64], smallest: float) -> NDArray[np.float64]:
+    """Places (n, d) in [-1, 1]^d, equally far apart, with those beside 1/2 and 1 moved nearer to it: see `graded`."""
+    if smallest == 1:
+        return grid
+    w = np.abs(grid)
+    inner = w + (1 - smallest) * np.sin(2 * np.pi * w) / (2 * np.pi)
+    outer = w - (1 - smallest) * np.sin(4 * np.pi * w) / (4 * np.pi)
+    exact = np.isin(w, (0.5, 1.0))  # the patch's edge without round-off
+    return np.sign(grid) * np.where(exact, w, np.where(w < 0.5, inner, outer))
+
+
+def on_sphere(cube: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit vectors (n, d) of places (n, d) on the cube's surface, at equal angles for equal distances there.
+
+    Ronchi, Iacono and Paolucci 1996, J. Comput. Phys. 124. Zero vectors stay.
+    """
+    slopes = np.tan(np.pi / 4 * cube)
+    return slopes / np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1e-300)
+
+
+def _sides(quads: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Edges (n, 2) that belong to one of the quadrilaterals (n, 4) only, in their sense of rotation."""
+    edges = np.stack([quads, np.roll(quads, -1, axis=1)], axis=2).reshape(-1, 2)
+    _, first, count = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
+    return edges[np.sort(first[count == 1])]
+
+
+def number(wanted: float) -> int:
+    """The whole number next to what is wanted, at least 1."""
+    return max(1, int(np.floor(wanted + 0.5)))

@@ -1,0 +1,1 @@
+"""Meshes made by other programs, read into one form."""

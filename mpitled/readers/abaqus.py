@@ -1,0 +1,368 @@
+"""Abaqus decks (.inp), as Abaqus/CAE, HyperMesh, Cubit, gmsh and CalculiX write them.
+
+Keywords that do not matter to an elastic solid with prescribed displacements are skipped and listed; those that
+change its mechanics and cannot be computed are kept as `MeshFile.refused`.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpitled.errors import InputError
+from mpitled.readers import meshfile
+from mpitled.readers.assembly import Definitions, Entry, Material, Model, Scope, Set
+from mpitled.readers.inp import COMMENT, Keyword, collect, fields
+from mpitled.readers.meshfile import Block, Cells, MeshFile, where
+
+_SOLID = re.compile(r"C3D(\d+)[A-Z]*")
+#: The kind of solid that the first nodes of a row of so many are; "other" where nodes between the corners matter.
+_SOLIDS = {
+    4: "tetrahedron", 5: "pyramid", 6: "wedge", 8: "hexahedron", 10: "tetrahedron",
+    15: "other", 20: "other", 27: "other",
+}  # fmt: skip
+
+#: Keywords, without blanks, that tie, load or move parts in ways that are not computed; what begins with CONTACT too.
+_REFUSED = {
+    "TIE", "MPC", "EQUATION", "COUPLING", "KINEMATICCOUPLING", "DISTRIBUTINGCOUPLING", "RIGIDBODY", "EMBEDDEDELEMENT",
+    "SHELLTOSOLIDCOUPLING", "TRANSFORM", "SPRING", "DASHPOT", "MASS", "ROTARYINERTIA", "CONNECTORSECTION",
+    "MODELCHANGE", "SUBMODEL", "CYCLICSYMMETRYMODEL", "FASTENER", "PRE-TENSIONSECTION", "GAP", "JOINT", "RELEASE",
+    "IMPERFECTION", "USERELEMENT", "MATRIXASSEMBLE", "BASEMOTION",
+}  # fmt: skip
+#: Keywords that make nodes or elements out of others.
+_GENERATING = {
+    "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYMMETRICMODELGENERATION", "IMPORT", "SUBSTRUCTUREPROPERTY",
+}  # fmt: skip
+#: Keywords of loads that are left out with a warning.
+_LOADS = {
+    "CLOAD", "DLOAD", "DSLOAD", "TEMPERATURE", "INITIALCONDITIONS", "FOUNDATION", "INERTIARELIEF", "CFLUX", "DFLUX",
+}  # fmt: skip
+#: Material options of other solids than elastic or neo-Hookean ones.
+_INELASTIC = {
+    "PLASTIC", "VISCOELASTIC", "HYPERFOAM", "MOHRCOULOMB", "DRUCKERPRAGER", "CREEP", "USERMATERIAL", "CONCRETE",
+    "HYPOELASTIC", "CLAYPLASTICITY", "CAPPLASTICITY", "CRUSHABLEFOAM", "DAMAGEINITIATION", "POROUSELASTIC",
+    "ANISOTROPICHYPERELASTIC", "EOS", "MULLINSEFFECT", "BRITTLECRACKING", "JOINTEDMATERIAL", "DEFORMATIONPLASTICITY",
+    "LOWDENSITYFOAM", "CASTIRONPLASTICITY", "SUPERELASTIC", "ACOUSTICMEDIUM", "CONCRETEDAMAGEDPLASTICITY",
+}  # fmt: skip
+
+
+def read(path: Path) -> MeshFile:
+    """The mesh of an Abaqus deck. InputError, with file and line, for all that is wrong with it."""
+    return _Reader(path).read()
+
+
+def files(path: Path) -> list[Path]:
+    """The deck and all files that it includes."""
+    found: list[Keyword] = []
+    opened: list[Path] = []
+    collect(path, path.parent, found, (), opened)
+    return opened
+
+
+def is_solid(type_name: str) -> bool:
+    """Whether an element of this type is a solid, even one that cannot be computed."""
+    return bool(_SOLID.fullmatch(type_name.upper()))
+
+
+# --- keywords ------------------------------------------------------------------------------------------------------
+
+
+class _Reader:
+    def __init__(self, path: Path) -> None:
+        self.keywords: list[Keyword] = []
+        collect(path, path.parent, self.keywords, (), [])
+        self.found = Definitions(path)
+        self.scope = self.found.root
+        self.system: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None  # rotation, origin
+        self.material: Material | None = None
+        self.step = 0
+        self.skipped: dict[str, None] = {}
+
+    def read(self) -> MeshFile:
+        for keyword in self.keywords:
+            self._take(keyword)
+            if keyword.name in ("NODE", "ELEMENT"):
+                keyword.data.clear()  # the text is not needed any more
+        self.keywords.clear()
+        if self.skipped:
+            self.found.remarks.append(f"{self.found.path}: skipped {meshfile.listed(self.skipped, 40)}")
+        return Model(self.found).file()
+
+    def _take(self, keyword: Keyword) -> None:
+        name = keyword.name
+        handler = getattr(self, f"_{name.lower()}", None) if name in _HANDLED else None
+        if handler:
+            handler(keyword)
+        elif name in _REFUSED or name.startswith(("CONTACT", "CONNECTOR")):
+            self.found.refused.append(f"{keyword.origin}: {keyword.shown} changes the mechanics and cannot be computed")
+        elif name in _GENERATING:
+            keyword.fail("makes nodes or elements out of others; let the preprocessor write them out")
+        elif name in _LOADS:
+            self.found.remarks.append(f"warning: {keyword.origin}: {keyword.shown} is not applied, as no load is")
+        elif name in _INELASTIC:
+            if self.material:
+                self.material.unusable = self.material.unusable or f"has {keyword.shown} ({keyword.origin})"
+        elif name.endswith("SECTION") and keyword.parameters.get("ELSET"):
+            self.scope.sections.append((keyword.parameters["ELSET"], "", keyword.origin))
+        else:
+            self.skipped[keyword.shown.upper()] = None
+
+    # Parts and instances
+
+    def _part(self, keyword: Keyword) -> None:
+        self.scope = self.found.parts[keyword.need("NAME").casefold()] = Scope(keyword.need("NAME"))
+
+    def _endpart(self, keyword: Keyword) -> None:
+        self.scope, self.system = self.found.root, None
+
+    def _assembly(self, keyword: Keyword) -> None:
+        self.scope, self.found.assembly = self.found.root, keyword.parameters.get("NAME", "")
+
+    def _endassembly(self, keyword: Keyword) -> None:
+        self.scope = self.found.root
+
+    def _instance(self, keyword: Keyword) -> None:
+        if keyword.flag("LIBRARY"):
+            keyword.fail("takes its part from a library; write the part into the deck")
+        part, name = keyword.need("PART"), keyword.need("NAME")
+        if part.casefold() not in self.found.parts:
+            keyword.fail(f"names part {part}, which the deck does not define")
+        if name.casefold() in self.found.instances:
+            keyword.fail(f"is a second one of the name {name}; rename one")
+        self.scope = self.found.instances[name.casefold()] = Scope(name)
+        self.scope.copy_from(self.found.parts[part.casefold()])
+        rows = keyword.numbers(2)
+        keyword.data.clear()
+        self.scope.points = [_moved(points, rows) for points in self.scope.points]
+
+    def _endinstance(self, keyword: Keyword) -> None:
+        self.scope, self.system = self.found.root, None
+
+    # Nodes, elements and sets
+
+    def _system(self, keyword: Keyword) -> None:
+        rows = keyword.numbers(2)
+        values = np.zeros(9)
+        given = [value for _, row in rows for value in row][:9]
+        values[: len(given)] = given
+        origin, along, beside = values.reshape(3, 3)
+        if not given:
+            self.system = None
+        elif len(given) <= 3:
+            self.system = np.eye(3), origin
+        else:
+            first = along - origin
+            third = np.cross(first, beside - origin) if len(given) > 6 else np.cross(first, [-first[1], first[0], 0])
+            if not (first.any() and third.any()):
+                keyword.fail("has its points in one line; correct them")
+            first, third = first / np.linalg.norm(first), third / np.linalg.norm(third)
+            self.system = np.stack([first, np.cross(third, first), third]), origin
+
+    def _node(self, keyword: Keyword) -> None:
+        tables = []
+        for block in keyword.data:
+            values, counts = meshfile.separated(block, float, COMMENT.encode(), blank=0.0)
+            tables.append(meshfile.table(values, counts, 4))
+        rows = np.concatenate(tables) if tables else np.empty((0, 4))
+        ids = meshfile.as_ids(rows[:, 0], "node", keyword.origin)
+        points = _cartesian(rows[:, 1:], keyword)
+        if self.system:
+            points = points @ self.system[0] + self.system[1]
+        scope = self.scope
+        scope.node_origins.append((sum(map(len, scope.ids)), keyword.origin))
+        scope.ids.append(ids)
+        scope.points.append(points)
+        if name := keyword.parameters.get("NSET"):
+            scope.add("node", name, Entry("labels", ids, None, keyword.origin))
+
+    def _element(self, keyword: Keyword) -> None:
+        kind_name = keyword.need("TYPE")
+        parts = [meshfile.separated(block, int, COMMENT.encode()) for block in keyword.data]
+        values = np.concatenate([np.empty(0, np.int64), *(part[0] for part in parts)])
+        counts = np.concatenate([np.empty(0, np.int64), *(part[1] for part in parts)])
+        del parts
+        match = _SOLID.fullmatch(kind_name.upper())
+        n_nodes = int(match[1]) if match else 0
+        if n_nodes in _SOLIDS:
+            rows = _regular(values, counts, n_nodes + 1, keyword)
+            kind = _SOLIDS[n_nodes]
+            nodes = rows[:, 1 : 1 + meshfile.SOLIDS.get(kind, n_nodes)]
+            if kind == "other" and len(rows):
+                self.found.refused.append(
+                    f"{keyword.origin}: {len(rows)} elements of type {kind_name}, with nodes between the corners, "
+                    "cannot be computed; mesh with C3D8"
+                )
+        else:
+            kind = "other"
+            rows = meshfile.table(values, counts, int(counts.max(initial=1)), -1)
+            nodes = rows[:, 1:]
+        ids = meshfile.checked_ids(rows[:, 0], "element", keyword.origin).copy()
+        self.scope.cells.append(Cells(kind, kind_name, ids, nodes, keyword.origin))
+        if name := keyword.parameters.get("ELSET"):
+            self.scope.add("cell", name, Entry("labels", ids, None, keyword.origin))
+
+    def _nset(self, keyword: Keyword) -> None:
+        self._any_set(keyword, "node", keyword.need("NSET"))
+        if other := keyword.parameters.get("ELSET"):
+            self.scope.add("node", keyword.need("NSET"), Entry("cells", f'"{other}"', None, keyword.origin))
+
+    def _elset(self, keyword: Keyword) -> None:
+        self._any_set(keyword, "cell", keyword.need("ELSET"))
+
+    def _any_set(self, keyword: Keyword, kind: str, name: str) -> None:
+        instance = keyword.parameters.get("INSTANCE")
+        self.scope.sets[kind].setdefault(name.casefold(), Set(name))
+        if keyword.flag("GENERATE"):
+            for origin, entries in keyword.rows():
+                first, last, step = (meshfile.integer(e or "1", origin) for e in [*entries, "", "", ""][:3])
+                last = last if len(entries) > 1 else first
+                if step < 1 or last < first:
+                    raise InputError(f"{origin}: {first}, {last}, {step} is no range; give first, last, increment")
+                meshfile.checked_ids(np.array([first, last]), kind, origin)
+                self.scope.add(kind, name, Entry("range", (first, last, step), instance, origin))
+            return
+        for block in keyword.data:
+            for line, chunk in block.chunks():
+                found = meshfile.numbers_at_once(chunk, int, COMMENT.encode())
+                if found:
+                    self.scope.add(kind, name, Entry("labels", found[0], instance, keyword.origin))
+                    continue
+                part = Block(block.path, line, chunk, 0, len(chunk))
+                for at, text in part.lines(COMMENT):
+                    origin = where(block.path, at)
+                    for entry in filter(None, fields(text)):
+                        if entry.isdecimal():
+                            labels = np.array([meshfile.integer(entry, origin)])
+                            meshfile.checked_ids(labels, kind, origin)
+                            self.scope.add(kind, name, Entry("labels", labels, instance, origin))
+                        else:
+                            self.scope.add(kind, name, Entry("set", entry, instance, origin))
+
+    def _surface(self, keyword: Keyword) -> None:
+        kind = keyword.parameters.get("TYPE", "ELEMENT").upper()
+        if kind in ("ELEMENT", "NODE"):
+            self.scope.surfaces[keyword.need("NAME")] = kind, list(keyword.rows())
+        else:
+            self.skipped[f"{keyword.shown.upper()}, TYPE={kind}"] = None
+
+    # Materials and sections
+
+    def _material(self, keyword: Keyword) -> None:
+        name = keyword.need("NAME")
+        self.material = self.found.materials[name.casefold()] = Material(name, keyword.origin)
+
+    def _elastic(self, keyword: Keyword) -> None:
+        if not self.material:
+            keyword.fail("belongs to no *MATERIAL; put that above it")
+        if keyword.parameters.get("TYPE", "ISOTROPIC")[:3].upper() != "ISO":
+            self.material.unusable = f"has {keyword.shown}, TYPE={keyword.parameters['TYPE']} ({keyword.origin})"
+            return
+        rows = keyword.numbers(2)
+        if not rows:
+            keyword.fail("has no line with Young's modulus and Poisson's ratio")
+        if len(rows) > 1:
+            self.found.remarks.append(f"warning: {keyword.origin}: only the first row of {keyword.shown} is taken")
+        self.material.elastic = rows[0][1][0], (*rows[0][1], 0.0)[1]
+
+    def _hyperelastic(self, keyword: Keyword) -> None:
+        if not self.material:
+            keyword.fail("belongs to no *MATERIAL; put that above it")
+        if not keyword.flag("NEOHOOKE") or keyword.flag("TESTDATAINPUT"):
+            self.material.unusable = f"has {keyword.shown} other than NEO HOOKE with constants ({keyword.origin})"
+            return
+        rows = keyword.numbers(1)
+        c10, d1 = ([*rows[0][1], 0.0, 0.0] if rows else [0.0, 0.0])[:2]
+        if c10 <= 0 or d1 <= 0:
+            what = "incompressible, D1 = 0" if c10 > 0 and d1 == 0 else f"C10 = {c10:g}, D1 = {d1:g}"
+            self.material.unusable = f"is {what} ({keyword.origin})"
+            return
+        mu, bulk = 2 * c10, 2 / d1
+        self.material.elastic = 9 * bulk * mu / (3 * bulk + mu), (3 * bulk - 2 * mu) / (6 * bulk + 2 * mu)
+        self.found.remarks.append(
+            f"{keyword.origin}: material {self.material.name} has E = {self.material.elastic[0]:.6g} and nu = "
+            f"{self.material.elastic[1]:.6g} from C10 and D1, by mu = 2 C10 and K = 2/D1 at small strain"
+        )
+
+    def _density(self, keyword: Keyword) -> None:
+        rows = keyword.numbers(1)
+        if self.material and rows:
+            self.material.density = rows[0][1][0]
+
+    def _solidsection(self, keyword: Keyword) -> None:
+        material = keyword.need("MATERIAL")
+        self.scope.sections.append((keyword.need("ELSET"), material, keyword.origin))
+
+    # Steps
+
+    def _step(self, keyword: Keyword) -> None:
+        self.step += 1
+        self.material = None
+
+    def _boundary(self, keyword: Keyword) -> None:
+        kind = keyword.parameters.get("TYPE", "DISPLACEMENT").upper()
+        if kind != "DISPLACEMENT" or keyword.flag("USER") or keyword.flag("SUBMODEL"):
+            self.found.refused.append(
+                f"{keyword.origin}: {keyword.shown} prescribes by {'TYPE=' + kind if keyword.flag('TYPE') else 'USER'}"
+                "; only displacements can be prescribed"
+            )
+            return
+        if keyword.parameters.get("OP", "").upper() == "NEW":
+            self.found.boundaries = [(step, earlier) for step, earlier in self.found.boundaries if step == self.step]
+        if amplitude := keyword.parameters.get("AMPLITUDE"):
+            self.found.remarks.append(f"{keyword.origin}: amplitude {amplitude} is replaced by the loading curve")
+        self.found.boundaries.append((self.step, keyword))
+
+
+_HANDLED = {
+    "PART", "ENDPART", "ASSEMBLY", "ENDASSEMBLY", "INSTANCE", "ENDINSTANCE", "SYSTEM", "NODE", "ELEMENT", "NSET",
+    "ELSET", "SURFACE", "MATERIAL", "ELASTIC", "HYPERELASTIC", "DENSITY", "SOLIDSECTION", "STEP", "BOUNDARY",
+}  # fmt: skip
+
+
+def _moved(points: NDArray[np.float64], rows: list[tuple[str, list[float]]]) -> NDArray[np.float64]:
+    """Points of an instance: translated by its first line of data, then turned about an axis by its second."""
+    if rows:
+        points = points + np.array([*rows[0][1], 0.0, 0.0, 0.0])[:3]
+    if len(rows) > 1:
+        origin, values = rows[1]
+        axis = np.array(values[3:6]) - np.array(values[:3]) if len(values) == 7 else np.zeros(3)
+        if not axis.any():
+            raise InputError(f"{origin}: a rotation has two points of its axis and an angle; correct it")
+        x, y, z = axis / np.linalg.norm(axis)
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        angle = np.radians(values[6])
+        turn = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+        points = (points - values[:3]) @ turn.T + values[:3]
+    return points
+
+
+def _cartesian(points: NDArray[np.float64], keyword: Keyword) -> NDArray[np.float64]:
+    """Points of *NODE, SYSTEM=R, C (r, theta, z) or S (r, theta, phi; latitude), angles in degrees."""
+    system = keyword.parameters.get("SYSTEM", "R").upper()
+    if system == "R":
+        return points
+    r, theta, last = points.T
+    theta = np.radians(theta)
+    if system == "C":
+        return np.stack([r * np.cos(theta), r * np.sin(theta), last], axis=1)
+    if system == "S":
+        phi = np.radians(last)
+        return r[:, None] * np.stack([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)], axis=1)
+    keyword.fail(f"has SYSTEM={system}; there are R, C and S")
+
+
+def _regular(values: NDArray[np.int64], counts: NDArray[np.int64], width: int, keyword: Keyword) -> NDArray[np.int64]:
+    """Rows (n, width) of elements, each on one or more lines of its own."""
+    ends = np.cumsum(counts)
+    at_end = ends % width == 0
+    if len(values) % width or np.count_nonzero(at_end) * width != len(values):
+        row_ends = np.arange(width, len(values) + width, width)
+        bad = int(np.argmax(~np.isin(row_ends, ends)))
+        keyword.fail(
+            f"has rows that are not {width} numbers, an element and its {width - 1} nodes; "
+            f"the first is that of element {values[bad * width]}"
+        )
+    return values.reshape(-1, width)

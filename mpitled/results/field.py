@@ -1,0 +1,203 @@
+"""The displacement field of a result at any place: trilinear in hexahedra, moving least squares in the cloud."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mpitled import store
+from mpitled.errors import InputError
+from mpitled.mesh import CORNERS
+from mpitled.meshing.cloud import FACES, boundary_faces
+from mpitled.model import Model
+from mpitled.solver.support import moving_least_squares
+
+#: Where a value came from: inside a hexahedron, a support domain, or the hexahedron next to a place outside the mesh.
+IN_HEXAHEDRON, IN_CLOUD, OUTSIDE = 0, 1, 2
+
+_CANDIDATES = (16, 64)  # hexahedra with the nearest middles that are tried, and tried again where that fails
+_INSIDE = 1 + 1e-9  # in reference coordinates: a place on a face belongs to either cell
+_ITERATIONS = 30  # of Newton; sound cells need 4
+_CHUNK = 1 << 12  # places at once, so that the temporaries stay small
+# The eight sign products of the corners, whose coefficients make the trilinear map a polynomial.
+_r, _s, _t = CORNERS.T.astype(float)
+_MODES = np.stack([np.ones(8), _r, _s, _t, _r * _s, _s * _t, _r * _t, _r * _s * _t])
+
+
+class Values(NamedTuple):
+    """The field at places (n, 3)."""
+
+    displacement: NDArray[np.float64]  # (n, 3), m
+    source: NDArray[np.int8]  # (n,), IN_HEXAHEDRON, IN_CLOUD or OUTSIDE
+    outside: NDArray[np.float64]  # (n,), m from the mesh; 0 inside
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A model and the displacements of its nodes in one frame."""
+
+    model: Model
+    parameters: NDArray[np.float64]  # (n_nodes, 3), m: those of EFG nodes are not the field
+    at_nodes: NDArray[np.float64]  # (n_nodes, 3), m: the field at the nodes
+    basis: int
+    weight: str
+    share: float  # of the load time
+    complete: bool  # whether the run came to its end
+    metadata: dict[str, Any]  # what the run was started with
+
+    def at(self, places: NDArray[np.float64]) -> Values:
+        """The field at places (n, 3), m, of the undeformed body.
+
+        A place beside the mesh, as those on a curved surface are, has the value that the nearest hexahedron's map
+        gives there. In the cloud the support domain of the nearest integration point gives it.
+        """
+        model, n = self.model, len(places)
+        cells, xi, outside = locate(model.points, model.hexahedra, places)
+        source = np.where(outside > 0, OUTSIDE, IN_HEXAHEDRON).astype(np.int8)
+        if len(model.domains):
+            source[self._across_interface(cells, xi) & (outside > 0)] = IN_CLOUD
+        displacement = np.empty((n, 3))
+        fe = source != IN_CLOUD
+        displacement[fe] = np.einsum("na,nai->ni", _shapes(xi[fe]), self.parameters[model.hexahedra[cells[fe]]])
+        if not fe.all():
+            nearest = cKDTree(model.domain_points).query(places[~fe])[1]
+            nodes = model.domains[nearest]
+            values, _, _ = moving_least_squares(model.points[nodes], places[~fe], self.basis, self.weight)
+            displacement[~fe] = np.einsum("na,nai->ni", values, self.parameters[nodes])
+        return Values(displacement, source, np.where(fe, outside, 0.0))
+
+    def _across_interface(self, cells: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Places (n,) that lie beyond a face of their hexahedron with nothing but interface nodes, or have none."""
+        if not len(self.model.hexahedra):
+            return np.ones(len(cells), bool)
+        interface = np.zeros(self.model.n_nodes, bool)
+        interface[self.model.node_sets.get("interface", [])] = True
+        faces = interface[self.model.hexahedra[cells][:, FACES]].all(
+            axis=2
+        )  # t = -1, t = 1, s = -1, r = 1, s = 1, r = -1
+        r, s, t = xi.T
+        beyond = np.stack([t < -1, t > 1, s < -1, r > 1, s > 1, r < -1], axis=1)
+        return np.logical_and(faces, beyond).any(axis=1)
+
+
+def open_field(path: Path, frame: int = -1) -> Field:
+    """The field of a run's folder, or of its result.vtkhdf beside model.h5, in a frame (negative: from the last).
+
+    InputError if one of the two files is missing or they are not of one run.
+    """
+    with store.open_result(path) as result:
+        model = store.read_model(result.path.parent / "model.h5")
+        if not np.array_equal(result.node_points, model.points):
+            raise InputError(f"{result.path}: is not a result of the model beside it; run the deck again")
+        if result.n_frames == 0:
+            raise InputError(f"{result.path}: has no frame; run the deck again")
+        support = result.metadata["deck"]["support"]
+        return Field(
+            model=model,
+            parameters=result.at_nodes("displacement", frame),
+            at_nodes=result.at_nodes("field_displacement", frame),
+            basis=support["basis"],
+            weight=support["weight"],
+            share=float(result.times[frame] / result.metadata["load_time_s"]),
+            complete=result.complete,
+            metadata=result.metadata,
+        )
+
+
+def locate(
+    points: NDArray[np.float64], hexahedra: NDArray[np.int64], places: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Cells (n,), reference coordinates in them (n, 3), and distances to them (n,), m, of places (n, 3).
+
+    Places in no hexahedron have the one that comes nearest, by the place with their coordinates cut at the faces, and
+    coordinates beyond [-1, 1]; infinitely far where there are no hexahedra.
+    """
+    n = len(places)
+    cells, xi, distance = np.zeros(n, np.int64), np.zeros((n, 3)), np.full(n, np.inf)
+    if not len(hexahedra):
+        return cells, xi, distance
+    tree = cKDTree(points[hexahedra].mean(axis=1))
+    missed = np.arange(n)
+    for k in _CANDIDATES:
+        for first in range(0, len(missed), _CHUNK):
+            rows = missed[first : first + _CHUNK]
+            near = tree.query(places[rows], min(k, len(hexahedra)))[1].reshape(len(rows), -1)
+            cells[rows], xi[rows], distance[rows] = _best(points, hexahedra, near, places[rows])
+        missed = np.flatnonzero(distance > 0)
+    return cells, xi, distance
+
+
+def _best(
+    points: NDArray[np.float64], hexahedra: NDArray[np.int64], near: NDArray[np.int64], places: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Of candidates (n, k) the cell that holds the place or comes nearest to it; see `locate`."""
+    n, k = near.shape
+    corners = points[hexahedra[near.ravel()]]
+    at = np.repeat(places, k, axis=0)
+    xi, converged = _inverse(corners, at)
+    inside = np.abs(xi).max(axis=1) <= _INSIDE
+    cut = np.einsum("na,nai->ni", _shapes(np.clip(xi, -1, 1)), corners)
+    distance = np.where(inside, 0.0, np.linalg.norm(cut - at, axis=1))
+    distance[~converged] = np.inf
+    # Of cells that share the place the one that holds it best, so that the answer depends on the geometry only.
+    order = np.lexsort((np.abs(xi).max(axis=1).reshape(n, k), distance.reshape(n, k)), axis=1)[:, 0]
+    best = np.arange(n) * k + order
+    return near.ravel()[best], xi[best], distance[best]
+
+
+def _inverse(corners: NDArray[np.float64], at: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Reference coordinates (n, 3) of places (n, 3) in trilinear cells (n, 8, 3) by Newton, and where it converged.
+
+    Coordinates stay within [-8, 8]: of cells that far away nobody wants more than that they are.
+    """
+    modes = _MODES @ corners / 8
+    size = np.abs(modes[:, 1:4]).max(axis=(1, 2))[:, None]
+    xi = np.zeros_like(at)
+    for _ in range(_ITERATIONS):
+        step = np.linalg.solve(_slopes(modes, xi, size), (at - _place(modes, xi))[..., None])[..., 0]
+        xi = np.clip(xi + np.clip(step, -2, 2), -8, 8)
+        if np.abs(step).max(initial=0) < 1e-13:
+            break
+    return xi, np.abs(at - _place(modes, xi)).max(axis=1) < 1e-9 * size[:, 0]
+
+
+def _place(modes: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Places (n, 3) at reference coordinates (n, 3)."""
+    r, s, t = xi.T
+    return np.einsum("mn,nmi->ni", np.stack([np.ones_like(r), r, s, t, r * s, s * t, r * t, r * s * t]), modes)
+
+
+def _slopes(modes: NDArray[np.float64], xi: NDArray[np.float64], size: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Derivatives (n, 3, 3), place by reference coordinate, with a trace of the identity lest one be singular."""
+    r, s, t = (x[:, None] for x in xi.T)
+    _, R, S, T, RS, ST, RT, RST = modes.transpose(1, 0, 2)
+    slopes = np.stack(
+        [R + s * RS + t * RT + s * t * RST, S + r * RS + t * ST + r * t * RST, T + s * ST + r * RT + r * s * RST]
+    )
+    return slopes.transpose(1, 2, 0) + 1e-12 * size[..., None] * np.eye(3)
+
+
+def _shapes(xi: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Trilinear shape functions (n, 8) at reference coordinates (n, 3) (paper, eq. 4.4)."""
+    return (1 + CORNERS * xi[:, None, :]).prod(axis=2) / 8
+
+
+def prescribed(model: Model) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Nodes (n_nodes,) that are prescribed in all three directions, and those of them that move."""
+    nodes = model.prescribed_dofs // 3
+    every = np.bincount(nodes, minlength=model.n_nodes) == 3
+    moves = np.bincount(nodes, (model.prescribed_displacements != 0) | model.prescribed_turns.any(1), model.n_nodes) > 0
+    return every, every & moves
+
+
+def outer_faces(model: Model) -> NDArray[np.int64]:
+    """Faces (n, 4) of hexahedra on the body's surface: those of one hexahedron only and not on the cloud."""
+    faces = boundary_faces(model.hexahedra)
+    interface = np.zeros(model.n_nodes, bool)
+    interface[model.node_sets.get("interface", [])] = True
+    return faces[~interface[faces].all(axis=1)]

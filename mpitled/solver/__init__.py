@@ -1,0 +1,1 @@
+"""The mechanics and the time loop of one rank, and what ranks exchange."""

@@ -1,0 +1,189 @@
+"""Marching through time: the central difference with the model's masses, scaled (quasi-static) or not (dynamic)."""
+
+from __future__ import annotations
+
+import math
+from copy import copy, deepcopy
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpitled.deck import Solver
+from mpitled.errors import InputError
+from mpitled.solver import kernels
+from mpitled.solver.halo import Halo, World
+from mpitled.solver.sharpness import Sharpness
+from mpitled.solver.step import at_rest, compose_forces, compose_march, rehearse
+from mpitled.solver.subdomain import Subdomain
+from mpitled.solver.survey import Survey
+
+#: The cells are surveyed at least so many times in a run, and at least once in so many steps: a survey takes about the
+#: time of one step and a half, below 2 % of a long run.
+SURVEYS, LONGEST_UNWATCHED = 100, 80
+#: More steps than that nobody waits for: they come of a slip in the units of a density or a modulus.
+MOST_STEPS = 1e8
+#: A step that was shortened grows again when it could be longer by this factor.
+REGAIN = 1.25
+
+
+class March:
+    """A run in steps of time. Every rank takes the same decisions, from figures that are the same on all.
+
+    Where the step is longer than the survey proves stable, either the nodes that need it become heavier (quasi-static
+    runs with `mass_scaling`) or the step shorter, with the central difference for variable steps.
+    """
+
+    #: What has to be put back to return to an earlier state.
+    REMEMBERED = ("state", "added_mass", "added_energy", "frame")
+
+    def __init__(
+        self,
+        solver: Solver,
+        frames: int,
+        sub: Subdomain,
+        world: World,
+        force_halo: Halo | None,
+        halo: Halo | None,
+        model: dict[str, Any],
+    ) -> None:
+        """halo sums one component; model: figures of the preprocessor."""
+        self.sub, self.world, self.halo, self.solver, self.safety = sub, world, halo, solver, solver.safety
+        self.scales_mass = solver.mass_scaling and solver.method == "quasi-static"
+        self.typical = model["critical_step_typical_s"]  # by the bound
+        self.end = solver.load_time + solver.hold_time
+        self.frame_span = self.end / frames
+        self.frame = 0
+        self.state = at_rest(sub, solver.load_time, 1.0)
+        self.survey = Survey(sub)
+        self.held = np.concatenate([sub.fixed, sub.moving])
+        nodes, directions = np.unique(self.held // 3, return_counts=True)
+        self.prescribed: NDArray[np.int64] = nodes[directions == 3].astype(np.int64)  # need no mass for stability
+        self.added_mass, self.added_energy = 0.0, 0.0
+        self.forces, self.motion = compose_forces(sub, force_halo), compose_march(sub)
+        self.sharpness = Sharpness(sub, world, self.forces, sub.free())
+
+    def begin(self) -> None:
+        """Find the step. Collective. InputError, alike on all ranks, for a step that is too long."""
+        s, solver = self.state, self.solver
+        self.survey.look(s, self.safety)
+        required = self._required()
+        if self.scales_mass:
+            critical = self.typical / math.sqrt(self.sharpness.share)
+        else:
+            critical = s.time_step / (self.safety * float(np.sqrt(self._largest((required / s.mass).max()))))
+        if solver.time_step == "auto":
+            self.longest = self.safety * critical
+        else:
+            self.longest = float(solver.time_step)
+            if not self.scales_mass and self.longest > critical:
+                raise InputError(
+                    f"solver.time_step = {self.longest:g}: is longer than the critical step of the undeformed model, "
+                    f"{critical:.3g} s; give at most {math.floor(critical * 1e8) / 1e8:g}, or leave it to auto"
+                )
+        if self.end / self.longest > MOST_STEPS:
+            raise InputError(
+                f"solver.load_time = {solver.load_time:g}: takes {self.end / self.longest:.2g} steps of "
+                f"{self.longest:.2g} s; check the units of densities and moduli, or shorten it"
+            )
+        self.between = int(min(LONGEST_UNWATCHED, max(1, self.end / self.longest // SURVEYS)))
+        s.time_step = self._fitting(self.longest, self.frame_span)
+        np.divide(s.time_step**2, s.mass, out=s.mobility)
+
+    def _largest(self, value: float) -> float:
+        return float(self.world.gather([value]).max())
+
+    def _fitting(self, longest: float, span: float) -> float:
+        """The longest step, none longer than that, of which whole surveys fill the span."""
+        return span / (self.between * math.ceil(span / (longest * self.between) * (1 - 1e-9)))
+
+    @property
+    def frame_time(self) -> float:
+        """Time of the present frame, s."""
+        return self.state.time
+
+    @property
+    def expected_steps(self) -> int:
+        """Steps of the whole run, if the step stays what it is."""
+        return round(self.end / self.state.time_step)
+
+    @property
+    def progress(self) -> float:
+        """Share of the run that is done."""
+        return self.state.time / self.end
+
+    def warm_up(self) -> None:
+        """Call every kernel once, on the state at rest, without other ranks."""
+        twin = copy(self)
+        twin.state, twin.halo, twin.sharpness = deepcopy(self.state), None, self.sharpness.asleep()
+        rehearse(twin.state, (*self.forces, *self.motion))
+        twin.look()
+
+    def look(self) -> dict[str, float]:
+        """This rank's share of the figures at the present time, for which the forces are there.
+
+        Sums, in J: "external", "strain", "hourglass", "stabilisation", "kinetic", "added", "dissipated"; in kg:
+        "added_mass". Extremes: "min_jacobian" (of all steps), "step_ratio": the step over the one proved stable.
+        """
+        s, owned = self.state, self.sub.rows.owned
+        found = self.survey.look(s, self.safety)
+        required = self._required()
+        found["kinetic"] = kernels.kinetic_energy(s.u, s.u_prev, s.f, s.mass, s.mobility, owned, self.held, s.time_step)
+        found["step_ratio"] = self.safety * float(np.sqrt((required / s.mass).max()))
+        if self.scales_mass:
+            mass, energy = kernels.raise_mass(s.u, s.u_prev, s.mass, s.mobility, required, owned, s.time_step)
+            self.added_mass += mass
+            self.added_energy += energy
+            found["step_ratio"] = min(found["step_ratio"], self.safety)
+        return found | {
+            "external": s.external_work,
+            "added": self.added_energy,
+            "added_mass": self.added_mass,
+            "dissipated": 0.0,
+        }
+
+    def _required(self) -> NDArray[np.float64]:
+        """Mass (kg) that each node needs after a survey, on all ranks; renews now and then how sharp its bound is."""
+        s, required = self.state, self.survey.required[0]
+        if self.halo is not None:
+            self.halo.sum(self.survey.required)
+        required[self.prescribed] = 0
+        if self.sharpness.due():
+            mass = required if self.scales_mass else s.mass
+            mobility = np.divide(1.0, mass, out=np.zeros_like(mass), where=mass > 0)
+            bound = (2 * self.safety / s.time_step) ** 2
+            if not self.scales_mass:
+                bound *= self._largest((required / s.mass).max())
+            self.sharpness.renew(s, mobility, bound)
+        required *= self.sharpness.share
+        return required
+
+    def decide(self, figures: dict[str, float]) -> tuple[bool, bool]:
+        """The length of the next steps; whether a frame is due now, and whether it is the last."""
+        s = self.state
+        due = s.time >= self.frame * self.frame_span - 0.5 * s.time_step
+        if due:
+            s.time = self.frame * self.frame_span  # without the round-off of its sum
+            self.frame += 1
+        if s.time >= self.end - 0.5 * s.time_step:
+            return due, True
+        allowed = min(self.longest, s.time_step * self.safety / figures["step_ratio"])
+        if due or allowed < s.time_step or allowed > REGAIN * s.time_step:
+            self._take(self._fitting(allowed, self.frame * self.frame_span - s.time))
+        return due, False
+
+    def harden(self) -> None:
+        """Go on with steps shorter by a third, or twice the mass where the step needs it, watched twice as often."""
+        self.safety /= math.sqrt(2)
+        if not self.scales_mass:
+            self.longest /= math.sqrt(2)
+        self.between = max(1, self.between // 2)
+
+    def _take(self, time_step: float) -> None:
+        s = self.state
+        ratio = time_step / s.time_step
+        if abs(ratio - 1) < 1e-12:
+            return
+        np.divide(time_step**2, s.mass, out=s.mobility)
+        kernels.change_step(s.u, s.u_prev, s.f, s.mobility, ratio)
+        s.time_step = time_step

@@ -1,0 +1,183 @@
+"""Dynamic relaxation: damped steps of a fictitious time to the static solution, ended by their distance from it."""
+
+from __future__ import annotations
+
+import math
+from copy import copy, deepcopy
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpitled.deck import Solver
+from mpitled.solver import kernels
+from mpitled.solver.halo import Halo, World
+from mpitled.solver.sharpness import Sharpness
+from mpitled.solver.step import State, at_rest, compose_forces, compose_relaxation, rehearse
+from mpitled.solver.subdomain import Subdomain
+from mpitled.solver.survey import Survey
+
+#: Steps between surveys.
+BETWEEN = 10
+#: A mass tensor's trace falls to no less than this share from one survey to the next.
+KEEP = 0.9
+#: The estimate has to hold at so many surveys in a row.
+SETTLED = 3
+#: It has stalled when so many surveys in a row have not brought the least estimate down by this factor: round-off.
+STALLED, BETTER = 300, 0.99
+
+
+class Relaxation:
+    """Steps of length 1 with mass tensors that make each node as fast as stability lets it be.
+
+    After Joldes, Wittek and Miller (2011): damping is critical for the lowest eigenvalue, which Rayleigh's quotient of
+    the last changes of displacements and forces estimates as it goes. Beyond it: a support domain's mass is a tensor,
+    because next to a grown tumour its stiffness across the stretched layers is thousands of times that along them, and
+    scalar masses would make the latter slow. While the load grows nothing is damped: drag would hold nodes back, and a
+    growing seed run into them. The distance to the static solution is taken from the slowest mode, as its
+    speed over its frequency and as its acceleration over its frequency squared, whichever is more.
+    """
+
+    #: What has to be put back to return to an earlier state.
+    REMEMBERED = ("state", "u_then", "f_then", "lowest", "distance", "frame", "settled", "best", "waited")
+
+    def __init__(
+        self,
+        solver: Solver,
+        frames: int,
+        sub: Subdomain,
+        world: World,
+        force_halo: Halo | None,
+        halo: Halo | None,
+    ) -> None:
+        """halo sums six components."""
+        self.sub, self.halo, self.safety, self.frames = sub, halo, solver.safety, frames
+        self.tolerance = solver.tolerance
+        self.between = BETWEEN
+        self.load_time = float(solver.load_steps)
+        self.state = at_rest(sub, self.load_time, 1.0)
+        self.state.mass = np.zeros((6, sub.n_nodes))
+        self.state.mobility = np.zeros((6, sub.n_nodes))
+        self.survey = Survey(sub)
+        self.required = np.zeros((6, sub.n_nodes))
+        self.free = sub.free()
+        self.counted: NDArray[np.float64] = self.free * sub.rows.owned  # free dofs that this rank owns
+        self.u_then, self.f_then = np.zeros((3, sub.n_nodes)), np.zeros((3, sub.n_nodes))
+        self.lowest, self.distance, self.frame, self.settled = 0.0, math.inf, 0, 0
+        self.best, self.waited = math.inf, 0
+        self.forces, self.motion = compose_forces(sub, force_halo), compose_relaxation(sub, self.counted)
+        self.sharpness = Sharpness(sub, world, self.forces, self.free)
+
+    def start_from(self, s: State, energy: float) -> None:
+        """Go on from the displacements of another run at the end of its load, at rest; `energy` (J) is in its cells."""
+        self.state.place(s.u)
+        self.state.time = self.state.load_time
+        self.u_then[:] = s.u[:, : self.sub.n_nodes]
+        self.state.external_work = energy
+        self.frame = self.frames
+
+    def begin(self) -> None:
+        """Find how sharp the bound of stiffness is. Collective."""
+        self._bound()
+
+    @property
+    def stalled(self) -> bool:
+        """Whether it comes no nearer to the static solution, though that is farther than the tolerance."""
+        return self.waited >= STALLED
+
+    @property
+    def frame_time(self) -> float:
+        """Share of the load at the present frame: time is fictitious here."""
+        return self.state.share
+
+    @property
+    def expected_steps(self) -> int:
+        """Steps in which the load grows; how many follow nobody knows beforehand."""
+        return round(self.load_time)
+
+    @property
+    def progress(self) -> float:
+        """Share of the run that is done, as far as one can tell: half for the load, half for what follows."""
+        s = self.state
+        if s.share < 1:
+            return 0.5 * s.share
+        done = math.log10(self.tolerance / min(max(self.distance, self.tolerance), 1.0)) / math.log10(self.tolerance)
+        return 0.5 + 0.5 * max(0.0, min(1.0, 1 - abs(done)))
+
+    def warm_up(self) -> None:
+        """Call every kernel once, on the state at rest, without other ranks."""
+        twin = copy(self)
+        twin.state, twin.halo, twin.sharpness = deepcopy(self.state), None, self.sharpness.asleep()
+        twin.u_then, twin.f_then = self.u_then.copy(), self.f_then.copy()
+        rehearse(twin.state, (*self.forces, *self.motion))
+        twin.look()
+
+    def look(self) -> dict[str, float]:
+        """As `March.look`; "dissipated" (J) is what damping and the change of masses took, by the work of the forces.
+
+        More sums: "rayleigh_force", "rayleigh_mass". More extremes: "change", "residual" (m).
+        """
+        s = self.state
+        found = self._bound()
+        kernels.renew_tensors(s.mass, self.required, s.mobility, self.free, KEEP)
+        kinetic, work, force, mass, change, residual = kernels.watch_relaxation(
+            s.u, s.u_prev, s.f, s.mass, s.mobility, self.counted, self.u_then, self.f_then
+        )
+        return found | {
+            "kinetic": kinetic,
+            "external": s.external_work,
+            "added": 0.0,
+            "added_mass": 0.0,
+            "dissipated": -s.free_work - work - kinetic,
+            "step_ratio": self.safety,
+            "rayleigh_force": force,
+            "rayleigh_mass": mass,
+            "change": change,
+            "residual": residual,
+        }
+
+    def harden(self) -> None:
+        """Go on from rest, with masses twice as large and the load half as fast, watched twice as often."""
+        self.state.place(self.state.u)
+        self.safety /= math.sqrt(2)
+        self.between = max(1, self.between // 2)
+        self.load_time *= 2
+        self.state.time *= self.load_time / self.state.load_time
+        self.state.load_time = self.load_time
+
+    def _bound(self) -> dict[str, float]:
+        """Survey, and fill `required` with the masses that a stable step needs, on all ranks."""
+        s = self.state
+        self.required[:] = 0
+        found = self.survey.look(s, self.safety, self.required)
+        for diagonal in (0, 3, 5):
+            self.required[diagonal] += self.survey.required[0]
+        if self.halo is not None:
+            self.halo.sum(self.required)
+        if self.sharpness.due() and (s.share < 1 or self.sharpness.share == 0):
+            mobility = np.empty_like(self.required)
+            kernels.renew_tensors(np.zeros_like(self.required), self.required, mobility, self.free, 0.0)
+            self.sharpness.renew(s, mobility, (2 * self.safety) ** 2)
+        self.required *= self.sharpness.share
+        return found
+
+    def decide(self, figures: dict[str, float]) -> tuple[bool, bool]:
+        """Damping of the next steps; whether a frame is due now, and whether the static solution is reached."""
+        s = self.state
+        known = figures["rayleigh_force"] / figures["rayleigh_mass"] if figures["rayleigh_mass"] > 0 else 0.0
+        loaded = s.share >= 1
+        if loaded and known > 0:
+            steady = abs(known - self.lowest) < 0.3 * self.lowest
+            self.lowest = known
+            frequency = math.sqrt(known)
+            self.distance = max(figures["change"] / frequency, figures["residual"] / known)
+            self.settled = self.settled + 1 if steady and self.distance < self.tolerance else 0
+        damping = 2 * math.sqrt(self.lowest)
+        s.retain, s.gain = (2 - damping) / (2 + damping), 2 / (2 + damping)
+        if self.distance < BETTER * self.best:
+            self.best, self.waited = self.distance, 0
+        self.waited += loaded
+        if self.settled >= SETTLED or self.stalled:
+            return True, True
+        due = self.frame < self.frames and s.share >= self.frame / self.frames
+        self.frame += due
+        return due, False

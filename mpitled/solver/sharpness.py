@@ -1,0 +1,111 @@
+"""How sharp the bound of the cells' stiffness is: the assembled operator's largest eigenvalue, by power iteration.
+
+The sum of the cells' bounds is two to ten times the largest eigenvalue of the assembled stiffness, for neighbours do
+not swing in their stiffest modes together. The quotient is a matter of the mesh and changes slowly with the
+deformation; steps and masses that the bound asks for are relaxed by it.
+"""
+
+from __future__ import annotations
+
+import math
+from copy import copy
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpitled.solver.halo import World
+from mpitled.solver.step import State, Term
+from mpitled.solver.subdomain import Subdomain
+
+#: Most iterations from a random start, and from the last eigenvector; and the growth of Rayleigh's quotient in one at
+#: which they end. It grows towards the eigenvalue: what is missing is left to `solver.safety`, 0.64 of the eigenvalue.
+FIRST, AGAIN, CONVERGED = 60, 15, 1.01
+#: Share of randomness added to the last eigenvector, for a mode that was not there before.
+NOISE = 0.3
+#: What is found is rounded up to a power of this, so that ranks summed in another order find the same.
+RUNG = 1.02
+#: Surveys from one power iteration to the next where nothing changes; where the share grew by more than GROWS, one.
+SELDOM, GROWS = 5, 1.05
+
+
+class Sharpness:
+    """Power iteration on K = df/du in the present configuration, on all ranks; all of its calls are collective."""
+
+    def __init__(self, sub: Subdomain, world: World, forces: tuple[Term, ...], free: NDArray[np.float64]) -> None:
+        """free (3, n_nodes) is 1 at free dofs and 0 at prescribed ones."""
+        self._sub, self._world, self._forces, self._free = sub, world, forces, free
+        self._counted = free * sub.rows.owned
+        # Random numbers that belong to the nodes, whatever rank they are on.
+        numbers = 3.0 * sub.rows.nodes + np.arange(3)[:, None]
+        self._noise = (np.modf(np.abs(np.sin(12.9898 * (numbers + 1))) * 43758.5453)[0] - 0.5) * free
+        self._mode: NDArray[np.float64] | None = None
+        self.share = 0.0  # of the bound, that the operator has had at most
+        self.wait = 0  # surveys until it is looked for again
+        spread = float(np.ptp(sub.rows.points, axis=0).max()) if sub.n_nodes else 0.0
+        # m, of the largest displacement that is tried: well above round-off, well below a cell.
+        self._reach = float(np.finfo(sub.precision).eps) ** 0.5 * 0.02 * float(world.gather([spread]).max())
+
+    def asleep(self) -> Sharpness:
+        """A copy that asks nothing of other ranks at the next survey."""
+        twin = copy(self)
+        twin.share, twin.wait = 1.0, 1
+        return twin
+
+    def due(self) -> bool:
+        """Whether it is time to renew the share; called once a survey."""
+        self.wait -= 1
+        return self.wait < 0
+
+    def renew(self, s: State, mobility: NDArray[np.float64], bound: float) -> None:
+        """The share that the largest eigenvalue of `mobility` K has of its bound (alike), and when to ask again."""
+        found = self.largest_eigenvalue(s, mobility) / bound if bound > 0 else 0.0
+        self.wait = 0 if found > GROWS * self.share else SELDOM - 1
+        self.share = min(1.0, max(self.share, found)) or 1.0  # where nothing is free nothing is found
+
+    def largest_eigenvalue(self, s: State, mobility: NDArray[np.float64]) -> float:
+        """Largest eigenvalue (1/s^2 times the mobility's dt^2) of `mobility` K at the displacements of s, from below.
+
+        mobility, s^2/kg: (n_nodes,), or symmetric tensors (6, n_nodes); 0 where it does not matter.
+        """
+        n, iterations = self._sub.n_nodes, FIRST if self._mode is None else AGAIN
+        trial = copy(s)
+        trial.seen, trial.f = s.seen.copy(), np.zeros_like(s.f)
+        self._take(trial)
+        at_rest = trial.f[:, :n].astype(np.float64)
+        mode = self._noise.copy() if self._mode is None else self._mode + NOISE * self._noise
+        force, found = np.zeros_like(mode), 0.0
+        for iteration in range(iterations):
+            size = float(self._world.gather([np.abs(mode).max(initial=0.0)]).max())
+            if not 0 < size < math.inf:
+                return found
+            mode /= size
+            force /= size
+            trial.seen[:, :n] = s.u[:, :n] + self._reach * mode
+            trial.f[:] = 0
+            self._take(trial)
+            response = (trial.f[:, :n] - at_rest) * (self._free / self._reach)
+            # The mode is mobility times the last response, so that their product is mode . M mode.
+            sums = self._world.gather([(self._counted * mode * g).sum() for g in (response, force)]).sum(axis=0)
+            last = found
+            if iteration > 0 and sums[1] > 0:
+                found = float(sums[0] / sums[1])
+            mode, force = _times(mobility, response), response
+            if iteration > 2 and found < CONVERGED * last:
+                break
+        self._mode = mode / max(size * abs(found), 1e-300)
+        return float(RUNG ** math.ceil(math.log(found) / math.log(RUNG))) if found > 0 else 0.0
+
+    def _take(self, trial: State) -> None:
+        for _, term in self._forces:
+            term(trial)
+
+
+def _times(mobility: NDArray[np.float64], force: NDArray[np.float64]) -> NDArray[np.float64]:
+    if mobility.ndim == 1:
+        return mobility * force
+    m, (x, y, z) = mobility, force
+    return np.stack([
+        m[0] * x + m[1] * y + m[2] * z,
+        m[1] * x + m[3] * y + m[4] * z,
+        m[2] * x + m[4] * y + m[5] * z,
+    ])  # fmt: skip

@@ -1,0 +1,183 @@
+"""The step of a scene, composed of the terms that it needs: a term that a scene lacks is not in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpitled.loading import loading_curve
+from mpitled.solver import kernels
+from mpitled.solver.halo import Halo
+from mpitled.solver.subdomain import Subdomain
+
+
+@dataclass(slots=True)
+class State:
+    """What a step changes, on one rank."""
+
+    u: NDArray[np.float64]  # (3, n_nodes + PADDING), m, at the time of `step`
+    u_prev: NDArray[np.float64]  # (3, n_nodes + PADDING), m, one step before
+    seen: NDArray[np.floating]  # u as the cells read it: u itself, or its copy in single precision
+    f: NDArray[np.floating]  # (3, n_nodes + PADDING), N, internal forces, in the precision of `seen`
+    mass: NDArray[np.float64]  # (n_nodes,), kg, as scaled; in relaxation (6, n_nodes), its symmetric tensor
+    mobility: NDArray[np.float64]  # as mass, s^2/kg: dt^2 times its inverse
+    reaction: NDArray[np.float64]  # (n owned moving dofs,), N
+    load_time: float  # s
+    time_step: float  # s
+    time: float = 0.0  # s
+    step: int = 0
+    retain: float = 1.0  # share of the last step's motion that the next keeps in relaxation, and
+    gain: float = 1.0  # of the force that acts: see `kernels.relax`
+    smallest_jacobian: float = 1.0  # of all steps so far
+    external_work: float = 0.0  # J, of the moving dofs that this rank owns
+    free_work: float = 0.0  # J, of the internal forces at free dofs that this rank owns; counted in relaxation
+
+    def place(self, u: NDArray[np.float64]) -> None:
+        """Put the nodes at the displacements u (3, n_nodes), at rest."""
+        self.u[:, : u.shape[1]] = self.u_prev[:, : u.shape[1]] = u
+        self.seen[:] = self.u
+
+    @property
+    def share(self) -> float:
+        """Share of the load time that has passed."""
+        return min(1.0, self.time / self.load_time)
+
+    @property
+    def next_load(self) -> float:
+        """Share of the full load after the next step."""
+        return loading_curve((self.time + self.time_step) / self.load_time)
+
+
+Term = tuple[str, Callable[[State], None]]
+
+
+def at_rest(sub: Subdomain, load_time: float, time_step: float) -> State:
+    """The undeformed state, with the model's masses."""
+    u, u_prev = (np.zeros((3, sub.n_nodes + kernels.PADDING)) for _ in range(2))
+    seen = u if sub.precision == u.dtype else u.astype(sub.precision)
+    f = np.zeros_like(seen)
+    mass = sub.rows.mass.copy()
+    owned_moving = int(np.count_nonzero(sub.rows.owned[sub.moving // 3]))
+    return State(u, u_prev, seen, f, mass, time_step**2 / mass, np.zeros(owned_moving), load_time, time_step)
+
+
+def compose_forces(sub: Subdomain, halo: Halo | None) -> tuple[Term, ...]:
+    """The terms that make the nodal forces, in order: each kind of cell that is there, then the halo's sum."""
+    terms: list[Term] = []
+    runs, hexahedra, domains = sub.runs, sub.hexahedra, sub.domains
+    if runs is not None:
+
+        def voxels(s: State) -> None:
+            J = kernels.voxel_forces(s.seen, s.f, runs.start, runs.length, runs.scale, runs.coefficient)
+            s.smallest_jacobian = min(s.smallest_jacobian, J)
+
+        terms.append(("voxel hexahedra", voxels))
+    if hexahedra is not None:
+
+        def general(s: State) -> None:
+            J = kernels.hexahedron_forces(s.seen, s.f, hexahedra.nodes, hexahedra.geometry, hexahedra.coefficient)
+            s.smallest_jacobian = min(s.smallest_jacobian, J)
+
+        terms.append(("hexahedra", general))
+    if domains is not None:
+
+        def support_domains(s: State) -> None:
+            J = kernels.domain_forces(
+                s.seen, s.f, domains.nodes, domains.gradient, domains.position, domains.inverse, domains.coefficient,
+            )  # fmt: skip
+            s.smallest_jacobian = min(s.smallest_jacobian, J)
+
+        terms.append(("support domains", support_domains))
+    if halo is not None:
+        terms.append(("halo", lambda s: halo.sum(s.f)))
+    return tuple(terms)
+
+
+@dataclass(frozen=True, slots=True)
+class _Motion:
+    """Where the moving dofs go next: a share of where they go at full load, or, on arcs, what a term has computed."""
+
+    full: NDArray[np.float64]  # (n moving dofs,), m
+    dofs: NDArray[np.uint32]  # (n owned moving dofs,)
+    own_full: NDArray[np.float64]  # m
+    share: Callable[[State], float]  # of full and own_full
+    terms: tuple[Term, ...]  # taken before the share is asked for
+
+
+def _compose_motion(sub: Subdomain) -> _Motion:
+    owned = sub.rows.owned[sub.moving // 3]
+    full, turns = sub.moving_full, sub.moving_turns
+    dofs, own_full = sub.moving[owned], full[owned]
+    if turns is None:
+        return _Motion(full, dofs, own_full, lambda s: s.next_load, ())
+    ends, own_ends, own_turns = full, own_full, turns[owned]
+    full, own_full = full.copy(), own_full.copy()
+
+    def follow(s: State) -> None:
+        kernels.follow(full, ends, turns, s.next_load)
+        kernels.follow(own_full, own_ends, own_turns, s.next_load)
+
+    return _Motion(full, dofs, own_full, lambda s: 1.0, (("motion", follow),))
+
+
+def compose_march(sub: Subdomain) -> tuple[Term, ...]:
+    """The terms that move the nodes by their masses: the reactions where any dof moves, then the central difference."""
+    m, (copied, advance) = _compose_motion(sub), _compose_copy(sub)
+
+    def reactions(s: State) -> None:
+        s.external_work += kernels.react(
+            s.u, s.u_prev, s.f, s.mass, m.dofs, m.own_full, m.share(s), s.reaction, s.time_step
+        )
+
+    def update(s: State) -> None:
+        kernels.update(s.u, s.u_prev, s.f, s.mobility, sub.fixed, sub.moving, m.full, m.share(s), copied(s))
+        advance(s)
+
+    return (*m.terms, *((("reactions", reactions),) if len(m.dofs) else ()), ("update", update))
+
+
+def compose_relaxation(sub: Subdomain, counted: NDArray[np.float64]) -> tuple[Term, ...]:
+    """As `compose_march`, damped, and with a mass tensor at each node; counted (3, n_nodes): see `kernels.relax`."""
+    m, (copied, advance) = _compose_motion(sub), _compose_copy(sub)
+
+    def reactions(s: State) -> None:
+        s.external_work += kernels.react(
+            s.u, s.u_prev, s.f, None, m.dofs, m.own_full, m.share(s), s.reaction, s.time_step
+        )
+
+    def relax(s: State) -> None:
+        s.free_work += kernels.relax(
+            s.u, s.u_prev, s.f, s.mobility, counted, sub.fixed, sub.moving, m.full, m.share(s), s.retain, s.gain,
+            copied(s),
+        )  # fmt: skip
+        advance(s)
+
+    return (*m.terms, *((("reactions", reactions),) if len(m.dofs) else ()), ("update", relax))
+
+
+def rehearse(s: State, terms: tuple[Term, ...]) -> None:
+    """Take the terms once without other ranks, so that their kernels are compiled or loaded from the disk's cache."""
+    for name, term in terms:
+        if name != "halo":
+            term(s)
+
+
+def _compose_copy(sub: Subdomain) -> tuple[Callable[[State], Any], Callable[[State], None]]:
+    """What an update fills with the new displacements for the cells to read, and what ends the step."""
+
+    def swap(s: State) -> None:
+        s.u, s.u_prev = s.u_prev, s.u
+        s.time += s.time_step
+        s.step += 1
+
+    def swap_and_see(s: State) -> None:
+        swap(s)
+        s.seen = s.u
+
+    if sub.precision == np.float64:
+        return (lambda s: None), swap_and_see
+    return (lambda s: s.seen), swap

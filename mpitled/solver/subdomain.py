@@ -1,0 +1,268 @@
+"""One rank's part of the model in local numbers, packed as the kernels want it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpitled.material import hourglass_modulus
+from mpitled.mesh import CORNERS
+from mpitled.solver import hexahedra, support
+from mpitled.solver.kernels import BATCH_LANES, VOXEL_LANES
+from mpitled.store import PartRows
+
+#: Boxes in a row shorter than this are gathered: a run keeps a whole vector of lanes busy.
+SHORTEST_RUN = 4
+#: Edges of a box agree this well relative to their length: the round-off of coordinates far from the origin.
+BOX_TOLERANCE = 1e-11
+
+
+@dataclass(frozen=True, slots=True)
+class VoxelRuns:
+    """Equal boxes whose nodes follow each other along a grid line; arguments of `kernels.voxel_forces`."""
+
+    start: NDArray[np.uint64]  # (8, n_runs)
+    length: NDArray[np.uint64]  # (n_runs,), at most VOXEL_LANES
+    first_cell: NDArray[np.uint64]  # (n_runs,)
+    scale: NDArray[np.floating]  # (3, n_runs), 1/m
+    coefficient: NDArray[np.floating]  # (3, n_runs)
+    gram: NDArray[np.floating]  # (3, n_runs), 1/m^2
+
+
+@dataclass(frozen=True, slots=True)
+class HexahedronBatches:
+    """Hexahedra of any shape in lanes; arguments of `kernels.hexahedron_forces`."""
+
+    nodes: NDArray[np.uint32]  # (n_batches, 8, lanes)
+    cells: NDArray[np.uint32]  # (n_batches, lanes)
+    geometry: NDArray[np.floating]  # (n_batches, 30, lanes)
+    coefficient: NDArray[np.floating]  # (n_batches, 3, lanes)
+    gram: NDArray[np.floating]  # (n_batches, 6, lanes), 1/m^2
+    stiffness: NDArray[np.floating]  # (n_batches, lanes), N/m
+
+
+@dataclass(frozen=True, slots=True)
+class DomainBatches:
+    """Support domains in lanes; arguments of `kernels.domain_forces`."""
+
+    nodes: NDArray[np.uint32]  # (n_batches, n, lanes)
+    cells: NDArray[np.uint32]  # (n_batches, lanes)
+    gradient: NDArray[np.floating]  # (n_batches, 3 n, lanes), 1/m
+    position: NDArray[np.floating] | None  # (n_batches, 3 n, lanes), m; None without stabilisation
+    inverse: NDArray[np.floating] | None  # (n_batches, 6, lanes), 1/m^2
+    coefficient: NDArray[np.floating]  # (n_batches, 3, lanes)
+    gram: NDArray[np.floating]  # (n_batches, 6, lanes), 1/m^2
+    stiffness: NDArray[np.floating]  # (n_batches, lanes), N/m
+
+
+@dataclass(frozen=True, slots=True)
+class Subdomain:
+    """The part of the model on one rank, in local numbers and SI units.
+
+    A cell lives on exactly one rank. A node lives on every rank whose cells touch it; all of them move it alike, and
+    its owner alone writes it and counts it in sums. Local cells are hexahedra first, then support domains.
+    """
+
+    rows: PartRows
+    n_nodes: int
+    n_cells: int
+    runs: VoxelRuns | None
+    hexahedra: HexahedronBatches | None
+    domains: DomainBatches | None
+    fixed: NDArray[np.uint32]  # dofs (3 node + direction) that stay where they are
+    moving: NDArray[np.uint32]  # dofs that follow the loading curve
+    moving_full: NDArray[np.float64]  # (len(moving),), m at full load
+    moving_turns: NDArray[np.float64] | None  # (len(moving), 3), see `loading.turn`; None where all move straight
+    shared: tuple[tuple[int, NDArray[np.uint32]], ...]  # (rank, nodes shared with it), ranks ascending
+    precision: type[np.floating]  # of the cells' arithmetic
+
+    def free(self) -> NDArray[np.float64]:
+        """(3, n_nodes): 1 at free dofs, 0 at prescribed ones."""
+        free = np.ones((3, self.n_nodes))
+        for held in (self.fixed, self.moving):
+            free[held % 3, held // 3] = 0
+        return free
+
+
+def localise(
+    rows: PartRows, hourglass: float, stabilisation: float, rule: str, precision: type[np.floating] = np.float64
+) -> Subdomain:
+    """Local numbers and packed cells of a part.
+
+    hourglass is R_hg of eq. 4.22, stabilisation the share s of design (0: the paper's own support domains), rule the
+    hexahedron's gradient ("mean", or "centre" as in eq. 4.6). Local nodes ascend with the global ones, so that what
+    lay along a grid line still does.
+    """
+
+    def local(nodes: NDArray[np.int64]) -> NDArray[np.uint32]:
+        return np.searchsorted(rows.nodes, nodes).astype(np.uint32, copy=False)
+
+    n_hexahedra = len(rows.hexahedra)
+    mu = np.array([material.mu for material in rows.materials])[rows.material]
+    lam = np.array([material.lam for material in rows.materials])[rows.material]
+    lame = np.stack([mu, lam])
+    cells = local(rows.hexahedra)
+    box, edges = _boxes(rows.points, cells)
+    breaks = _run_breaks(cells, box, edges, rows.material[:n_hexahedra])
+    in_runs = np.repeat(np.diff(breaks) >= SHORTEST_RUN, np.diff(breaks)) & box
+    general = np.flatnonzero(~in_runs)
+    dofs = 3 * local(rows.prescribed_dofs // 3) + (rows.prescribed_dofs % 3).astype(np.uint32)
+    turns = rows.prescribed_turns.any(axis=1)
+    moves = (rows.prescribed_displacements != 0) | turns
+    return Subdomain(
+        rows=rows,
+        n_nodes=len(rows.nodes),
+        n_cells=len(rows.cells),
+        runs=_in(precision, _voxel_runs(cells, edges, lame[:, :n_hexahedra], breaks, in_runs, hourglass)),
+        hexahedra=_in(
+            precision, _hexahedron_batches(rows.points, cells, general, lame, len(rows.cells), hourglass, rule)
+        ),
+        domains=_in(precision, _domain_batches(rows, local(rows.domains), lame[:, n_hexahedra:], stabilisation)),
+        fixed=dofs[~moves],
+        moving=dofs[moves],
+        moving_full=rows.prescribed_displacements[moves],
+        moving_turns=rows.prescribed_turns[moves] if turns.any() else None,
+        shared=tuple(
+            (int(rank), local(rows.shared[first:last]))
+            for rank, first, last in zip(
+                rows.neighbours, rows.shared_offsets[:-1], rows.shared_offsets[1:], strict=True
+            )
+        ),
+        precision=precision,
+    )
+
+
+def _in(precision: type[np.floating], cells: Any) -> Any:
+    """Packed cells, or None, with their numbers that are not indices in this precision."""
+    if cells is None:
+        return None
+    arrays = {f.name: getattr(cells, f.name) for f in fields(cells)}
+    real = {
+        name: a.astype(precision, copy=False) for name, a in arrays.items() if a is not None and a.dtype.kind == "f"
+    }
+    return replace(cells, **real)
+
+
+def _boxes(points: NDArray[np.float64], cells: NDArray[np.uint32]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Which hexahedra are boxes along the axes, and the edges (n, 3) of the boxes that they would be."""
+    if len(cells) == 0:
+        return np.zeros(0, bool), np.zeros((0, 3))
+    edges = points[cells[:, 6]] - points[cells[:, 0]]
+    tolerance = BOX_TOLERANCE * np.abs(edges).max(axis=1)
+    box = np.all(edges > 0, axis=1)
+    for corner in range(1, 8):
+        offset = points[cells[:, corner]] - points[cells[:, 0]]
+        box &= np.abs(offset - (CORNERS[corner] + 1) / 2 * edges).max(axis=1) <= tolerance
+    return box, edges
+
+
+def _run_breaks(
+    cells: NDArray[np.uint32], box: NDArray[np.bool_], edges: NDArray[np.float64], material: NDArray[np.int16]
+) -> NDArray[np.int64]:
+    """First cells of rows of at most VOXEL_LANES equal boxes with nodes in a row, and the number of cells."""
+    n = len(cells)
+    if n == 0:
+        return np.zeros(1, np.int64)
+    follows = (cells[1:].astype(np.int64) - cells[:-1] == 1).all(axis=1) & box[1:] & box[:-1]
+    follows &= material[1:] == material[:-1]
+    follows &= (np.abs(edges[1:] - edges[:-1]) <= BOX_TOLERANCE * edges[1:]).all(axis=1)
+    first = np.concatenate([[0], np.flatnonzero(~follows) + 1])
+    place = np.arange(n) - np.repeat(first, np.diff(np.append(first, n)))
+    return np.append(np.flatnonzero(place % VOXEL_LANES == 0), n)
+
+
+def _voxel_runs(
+    cells: NDArray[np.uint32],
+    edges: NDArray[np.float64],
+    lame: NDArray[np.float64],
+    breaks: NDArray[np.int64],
+    in_runs: NDArray[np.bool_],
+    hourglass: float,
+) -> VoxelRuns | None:
+    if not in_runs.any():
+        return None
+    first = breaks[:-1][in_runs[breaks[:-1]]]
+    edge = edges[first].T
+    volume = edge.prod(axis=0)
+    gram = 1 / (2 * edge**2)
+    mu, lam = lame[:, first]
+    return VoxelRuns(
+        start=np.ascontiguousarray(cells[first].T, dtype=np.uint64),
+        length=np.diff(breaks)[in_runs[breaks[:-1]]].astype(np.uint64),
+        first_cell=first.astype(np.uint64),
+        scale=1 / (4 * edge),
+        coefficient=np.stack(
+            [mu * volume, lam * volume, hourglass * hourglass_modulus(lam, mu) * volume * gram.sum(axis=0) / 8]
+        ),
+        gram=gram,
+    )
+
+
+def _hexahedron_batches(
+    points: NDArray[np.float64],
+    cells: NDArray[np.uint32],
+    chosen: NDArray[np.int64],
+    lame: NDArray[np.float64],
+    n_cells: int,
+    hourglass: float,
+    rule: str,
+) -> HexahedronBatches | None:
+    if len(chosen) == 0:
+        return None
+    nodes = cells[chosen]
+    gradient_modes, x_modes, volumes = hexahedra.hadamard(points, nodes, rule)
+    gradients, _ = hexahedra.geometry(points, nodes, rule)
+    gamma = hexahedra.hourglass_vectors(points, nodes, gradients)
+    mu, lam = lame[:, chosen]
+    k = hexahedra.hourglass_stiffness(gradients, volumes, hourglass_modulus(lam, mu), hourglass)
+    geometry = np.concatenate([gradient_modes.reshape(-1, 18) / 8, x_modes.reshape(-1, 12)], axis=1)
+    return HexahedronBatches(
+        nodes=_lanes(nodes),
+        cells=_lanes(chosen[:, None].astype(np.uint32), n_cells)[:, 0],
+        geometry=_lanes(geometry),
+        coefficient=_lanes(np.stack([mu * volumes, lam * volumes, k], axis=1), 0),
+        gram=_lanes(_symmetric(np.einsum("eai,eaj->eij", gradients, gradients))),
+        stiffness=_lanes((k * np.linalg.eigvalsh(np.einsum("eam,ean->emn", gamma, gamma))[:, -1])[:, None], 0)[:, 0],
+    )
+
+
+def _domain_batches(
+    rows: PartRows, nodes: NDArray[np.uint32], lame: NDArray[np.float64], stabilisation: float
+) -> DomainBatches | None:
+    if len(nodes) == 0:
+        return None
+    position, inverse = support.linear_projector(rows.points[nodes])
+    mu, lam = lame
+    volume = rows.domain_volumes
+    kappa = support.stabilisation_stiffness(inverse, volume, lam + 2 * mu, stabilisation)
+    gram = np.einsum("gai,gaj->gij", rows.domain_gradients, rows.domain_gradients)
+    numbers = np.arange(len(rows.hexahedra), len(rows.cells), dtype=np.uint32)
+    stabilised = stabilisation > 0
+    return DomainBatches(
+        nodes=_lanes(nodes),
+        cells=_lanes(numbers[:, None], len(rows.cells))[:, 0],
+        gradient=_lanes(rows.domain_gradients),
+        position=_lanes(position) if stabilised else None,
+        inverse=_lanes(_symmetric(inverse)) if stabilised else None,
+        coefficient=_lanes(np.stack([mu * volume, lam * volume, kappa], axis=1), 0),
+        gram=_lanes(_symmetric(gram)),
+        stiffness=_lanes(kappa[:, None], 0)[:, 0],  # Q is a projector: its largest eigenvalue is one
+    )
+
+
+def _symmetric(tensors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """xx, xy, xz, yy, yz, zz (n, 6) of symmetric tensors (n, 3, 3)."""
+    return tensors.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+
+
+def _lanes(values, fill=None):  # type: ignore[no-untyped-def]
+    """(n, ...) -> (n_batches, numbers of a cell, lanes); lanes left over repeat the last cell, or hold `fill`."""
+    flat = values.reshape(len(values), -1)
+    missing = -len(flat) % BATCH_LANES
+    if missing:
+        last = flat[-1:] if fill is None else np.full_like(flat[-1:], fill)
+        flat = np.concatenate([flat, np.repeat(last, missing, axis=0)])
+    return np.ascontiguousarray(flat.reshape(-1, BATCH_LANES, flat.shape[1]).transpose(0, 2, 1))

@@ -1,0 +1,91 @@
+"""What is watched while a run goes on: energies, the balance between them, J; and the reason why it cannot go on."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from mpitled.errors import UnstableError
+from mpitled.solver.halo import World
+from mpitled.solver.march import March
+from mpitled.solver.relaxation import Relaxation
+from mpitled.solver.subdomain import Subdomain
+
+#: The energy balance may be wrong by this share of the largest energy; beyond it the run is unstable.
+BALANCE_LIMIT = 0.05
+#: So many steps from rest the ledger is too coarse to judge by: its trapezoidal rule is wrong by about 8 over the steps
+#: squared of what little energy there is.
+LEDGER_STARTS = 50
+#: What is not summed over the ranks.
+_EXTREMES = {"min_jacobian": min, "step_ratio": max, "change": max, "residual": max}
+
+
+class Watch:
+    """The ledger of a run on one rank, and its verdict, the same on all. Its calls are collective."""
+
+    def __init__(self, world: World, sub: Subdomain, volume: float) -> None:
+        """volume: of the whole model, m^3."""
+        self.world, self.sub = world, sub
+        self.figures: dict[str, float] = {}  # of all ranks, at the last look
+        self.own_energy = 0.0  # J, in this rank's cells
+        self.largest_kinetic_ratio = 0.0
+        self.interrupted = False
+        self._largest_energy = 0.0
+        # The strain energy of the undeformed body is no better than this, J: tr C - 3 and ln J are not quite 0.
+        self._noise = 8 * float(np.finfo(sub.precision).eps) * max(m.mu for m in sub.rows.materials) * volume
+
+    def look(self, method: March | Relaxation, interrupted: bool) -> None:
+        """Survey all ranks and keep the ledger; UnstableError, alike on all ranks, if the run cannot go on."""
+        state, world = method.state, self.world
+        own = method.look()
+        self.own_energy = own["strain"] + own["hourglass"] + own["stabilisation"]
+        table = world.gather([*own.values(), float(interrupted)])
+        columns = dict(zip(own, table.T, strict=False))
+        figures = {name: float(_EXTREMES.get(name, sum)(columns[name])) for name in own}
+        internal = figures["strain"] + figures["hourglass"] + figures["stabilisation"]
+        supplied = figures["external"] + figures["added"] - figures["dissipated"]
+        largest = max(self._largest_energy, abs(figures["external"]), internal, figures["kinetic"])
+        balance = abs(supplied - internal - figures["kinetic"])
+        figures["balance_error"] = balance / (largest or 1.0)
+        figures["kinetic_ratio"] = figures["kinetic"] / internal if internal > 0 else 0.0
+        self.figures, self.interrupted = figures, bool(table[:, -1].any())
+        finite = math.isfinite(internal + figures["kinetic"] + figures["external"])
+        if not finite or figures["min_jacobian"] <= 0:
+            reason = "a cell is turned inside out"
+        elif balance > BALANCE_LIMIT * largest + self._noise and state.step >= LEDGER_STARTS:
+            reason = (
+                f"the energy balance is wrong by {figures['balance_error']:.1%} (supplied {supplied:.3g} J, internal "
+                f"{internal:.3g} J, kinetic {figures['kinetic']:.3g} J)"
+            )
+        else:
+            self._largest_energy = largest
+            if state.share >= 0.1:
+                self.largest_kinetic_ratio = max(self.largest_kinetic_ratio, figures["kinetic_ratio"])
+            return
+        worst = int(np.argmin(np.where(np.isnan(columns["min_jacobian"]), -np.inf, columns["min_jacobian"])))
+        cell = world.broadcast(self._worst_cell(method) if world.rank == worst else None, worst)
+        raise UnstableError(
+            f"unstable at {state.share:.1%} of the load: {reason}; {cell}; the step is "
+            f"{figures['step_ratio']:.2f} of the longest stable one; load more slowly (solver.load_time, "
+            "solver.load_steps), refine the mesh or the cloud there, or enlarge cloud.radius"
+        )
+
+    def _worst_cell(self, method: March | Relaxation) -> str:
+        """What and where the cell with the smallest J on this rank is, in a few words."""
+        rows, jacobian, state = self.sub.rows, method.survey.jacobian[:-1], method.state
+        cell = int(np.argmin(np.where(np.isnan(jacobian), -np.inf, jacobian)))
+        n_hexahedra = len(rows.hexahedra)
+        hexahedron = cell < n_hexahedra
+        nodes = rows.hexahedra[cell] if hexahedron else rows.domains[cell - n_hexahedra]
+        local = np.searchsorted(rows.nodes, nodes)
+        x, y, z = 1e3 * (rows.points[local].mean(axis=0) if hexahedron else rows.domain_points[cell - n_hexahedra])
+        edges = rows.points[local] - rows.points[local].mean(axis=0)
+        stretched = edges + state.u[:, local].T - state.u[:, local].T.mean(axis=0)
+        stretch = np.linalg.norm(stretched, axis=1).max() / np.linalg.norm(edges, axis=1).max()
+        return (
+            f"worst is {'hexahedron' if hexahedron else 'support domain'} {rows.cells[cell]} "
+            f"({rows.materials[rows.material[cell]].name}) at ({x:.1f}, {y:.1f}, {z:.1f}) mm on rank {self.world.rank} "
+            f"with J = {jacobian[cell]:.3g} now, {state.smallest_jacobian:.3g} at its worst, and a stretch "
+            f"of {stretch:.3g}"
+        )

@@ -1,0 +1,202 @@
+"""What a run of a deck would do, without a step of it: terms, kernels, arrays, what is left out and why, how long."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import fields, is_dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mpitled.deck import Deck
+from mpitled.solver import run as runs
+from mpitled.solver.halo import World
+from mpitled.solver.march import March
+from mpitled.solver.subdomain import SHORTEST_RUN, Subdomain
+from mpitled.speed.witness import Call, distinct_bytes, witness
+
+#: Times that each term is called to tell how long it takes; the fastest counts, for others may use the machine too.
+CALLS = 9
+
+
+def dry_run(deck: Deck, directory: Path, world: World) -> str:
+    """Model, partition and composition as the run itself makes them, in words that are the same on all ranks.
+
+    Every kernel is called a few times on the undeformed body, to see which it is, what it takes and how long.
+    """
+    run = runs.prepare(deck, directory, world)
+    run.warm_up()
+    with runs.everywhere():
+        run.method.begin()
+    method, sub = run.method, run.sub
+    terms = [(name, partial(act, method.state)) for name, act in (*method.forces, *method.motion)]
+    calls, surveyed = witness(terms), witness([("survey", method.look)])
+    seconds = {name: _seconds(act) for name, act in terms}
+    step, survey = sum(seconds.values()), _seconds(method.look)
+    counts = [len(sub.rows.hexahedra), len(sub.rows.domains), sub.n_nodes, sum(len(nodes) for _, nodes in sub.shared)]
+    sizes = [distinct_bytes(calls) / sub.n_cells, _held_bytes(method) / sub.n_cells]
+    table = world.gather([*counts, *sizes, 1e3 * step, 1e3 * survey])
+    lines = [
+        f"{'rank':>4}{'hexahedra':>11}{'domains':>9}{'nodes':>9}{'shared':>8}{'step, bytes a cell':>20}"
+        f"{'held, bytes a cell':>20}{'step, ms':>10}{'survey, ms':>12}"
+    ]
+    for rank, row in enumerate(table):
+        numbers = [f"{value:{width}.0f}" for value, width in zip(row, (11, 9, 9, 8, 20, 20), strict=False)]
+        lines.append(f"{rank:4}{''.join(numbers)}{row[-2]:10.3f}{row[-1]:12.3f}")
+    lines += _told(calls, surveyed, seconds)
+    left_out = [world.broadcast(_left_out(deck, sub, world, calls, surveyed), rank) for rank in range(world.size)]
+    lines.append("left out:")
+    for what in dict.fromkeys(what for of_rank in left_out for what in of_rank):
+        ranks = [str(rank) for rank, of_rank in enumerate(left_out) if what in of_rank]
+        where = "" if len(ranks) == world.size else f" (on rank {', '.join(ranks)})"
+        lines.append(f"  {what}{where}")
+    return str(
+        world.broadcast("\n".join([*lines, *_forecast(run, table[:, -2].max() / 1e3, table[:, -1].max() / 1e3)]))
+    )
+
+
+def _seconds(act: Callable[[], object]) -> float:
+    seconds = []
+    for _ in range(CALLS):
+        begin = time.perf_counter()
+        act()
+        seconds.append(time.perf_counter() - begin)
+    return min(seconds)
+
+
+def _told(calls: Sequence[Call], surveyed: Sequence[Call], seconds: dict[str, float]) -> list[str]:
+    """Each term with its time, its kernels and their arrays, those of rank 0."""
+    lines = ["each step, on rank 0:"]
+    for name, of_term in seconds.items():
+        lines.append(f"  {name}, {1e3 * of_term:.3f} ms")
+        lines += _kernels([call for call in calls if call.term == name])
+    return [*lines, "each survey, on rank 0:", *_kernels(surveyed)]
+
+
+def _kernels(calls: Sequence[Call]) -> list[str]:
+    lines = []
+    for call in calls:
+        arrays = [f"{name} {'x'.join(map(str, a.shape))} {a.dtype}" for name, a in call.arrays.items()]
+        size = sum(a.nbytes for a in call.arrays.values()) / 1e6
+        text = f"{call.kernel}, {size:.3g} MB: {', '.join(arrays)}"
+        lines += textwrap.wrap(text, 118, initial_indent="    ", subsequent_indent="      ", break_on_hyphens=False)
+    return lines
+
+
+def _left_out(deck: Deck, sub: Subdomain, world: World, calls: Sequence[Call], surveyed: Sequence[Call]) -> list[str]:
+    """The kernels that are not called and the arguments that are not there, each with what spares them."""
+    called = {call.kernel for call in (*calls, *surveyed)}
+    spared: dict[str, list[str]] = {}
+    for kernel, why in reasons(deck, sub, world).items():
+        if why and kernel not in called:
+            spared.setdefault(why, []).append(kernel)
+    absent: dict[str, list[str]] = {}
+    for call in (*calls, *surveyed):
+        for name in call.absent:
+            absent.setdefault(name, []).append(call.kernel)
+    for name, kernels in absent.items():
+        spared.setdefault(_ABSENT[name](deck), []).append(f"{name} of {' and '.join(dict.fromkeys(kernels))}")
+    for what, why in _scene(deck, sub):
+        spared.setdefault(why, []).append(what)
+    return [f"{', '.join(names)}: {why}" for why, names in spared.items()]
+
+
+def reasons(deck: Deck, sub: Subdomain, world: World) -> dict[str, str]:
+    """Why each kernel is not called, if it is not; "" where it may yet be, later in the run."""
+    relaxes = deck.solver.method == "dynamic-relaxation"
+    hexahedra = "no hexahedra" if len(sub.rows.hexahedra) == 0 else ""
+    voxels = hexahedra or f"no {SHORTEST_RUN} equal boxes in a row"
+    general = hexahedra or f"all hexahedra are boxes, {SHORTEST_RUN} or more in a row"
+    domains = "no support domains"
+    alone = "one rank" if world.size == 1 else "no node is shared"
+    method = f'solver.method = "{deck.solver.method}"'
+    heavier = method if deck.solver.method != "quasi-static" else "solver.mass_scaling = false"
+    return {
+        "voxel_forces": voxels,
+        "voxel_survey": voxels,
+        "hexahedron_forces": general,
+        "hexahedron_survey": general,
+        "domain_forces": domains,
+        "domain_survey": domains,
+        "follow": "no node is turned",
+        "react": "no degree of freedom is moved",
+        "update": method,
+        "relax": method,
+        "change_step": method if relaxes else "",
+        "kinetic_energy": method,
+        "raise_mass": heavier,
+        "renew_tensors": method,
+        "watch_relaxation": method,
+        "pack": alone,
+        "clear": alone,
+        "unpack": alone,
+    }
+
+
+#: Why an argument of a kernel is not there.
+_ABSENT: dict[str, Callable[[Deck], str]] = {
+    "position": lambda deck: f"support.stabilisation = {deck.support.stabilisation:g}",
+    "inverse": lambda deck: f"support.stabilisation = {deck.support.stabilisation:g}",
+    "mass": lambda deck: "relaxation has no inertia where nodes are moved",
+    "copied": lambda deck: f'solver.precision = "{deck.solver.precision}"',
+    "tensor": lambda deck: f'solver.method = "{deck.solver.method}": masses are scalars',
+}
+
+
+def _scene(deck: Deck, sub: Subdomain) -> list[tuple[str, str]]:
+    """What else a scene may do without."""
+    lines = []
+    if deck.tumour is None:
+        lines.append(("tumour", "no [tumour]: no seed, no graded cloud, no volume balance"))
+    if len(sub.rows.materials) == 1:
+        lines.append(("materials", f"{sub.rows.materials[0].name} alone"))
+    return lines
+
+
+def _held_bytes(*roots: object) -> int:
+    """Bytes of all arrays that can be reached from some objects, each once."""
+    arrays: dict[int, int] = {}
+    seen: set[int] = set()
+    todo = list(roots)
+    while todo:
+        value: Any = todo.pop()
+        if isinstance(value, np.ndarray):
+            while isinstance(value.base, np.ndarray):
+                value = value.base
+            arrays[id(value)] = value.nbytes
+        elif id(value) not in seen:
+            seen.add(id(value))
+            if is_dataclass(value):
+                todo += [getattr(value, field.name) for field in fields(value)]
+            elif isinstance(value, list | tuple):
+                todo += value
+            elif isinstance(value, dict):
+                todo += value.values()
+            elif type(value).__module__.startswith("mpitled"):
+                todo += vars(value).values()
+    return sum(arrays.values())
+
+
+def _forecast(run: Any, step: float, survey: float) -> list[str]:
+    """How many steps, and how long they take on the slowest rank by what was measured."""
+    method, state = run.method, run.method.state
+    if isinstance(method, March):
+        length = f" of {state.time_step:.4g} s"
+        more = "; the step may become shorter where cells need it, and longer again"
+        if run.deck.solver.method == "quasi-static":
+            more = "; then a relaxation to rest, to tell the distance to it"
+    else:
+        length = " of load"
+        more = f"; then as many as come within {1e3 * method.tolerance:g} mm of rest, about as many again"
+    n = method.expected_steps
+    n_surveys = math.ceil(n / method.between)
+    return [
+        f"steps: {n}{length}, {n_surveys} surveys{more}",
+        f"loop: {n * step + n_surveys * survey:.3g} s on the slowest rank ({1e3 * step:.3g} ms a step, "
+        f"{1e3 * survey:.3g} ms a survey: the fastest of {CALLS} calls on this machine)",
+    ]

@@ -1,0 +1,181 @@
+"""What `mpitled check` prints: the contents of a mesh file or of a deck's mesh, after all checks of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpitled import preprocess
+from mpitled.deck import Deck, MeshFiles, load_deck
+from mpitled.errors import InputError
+from mpitled.mesh import Constraint
+from mpitled.meshing import checks
+from mpitled.readers import meshes
+from mpitled.readers.meshfile import MeshFile
+from mpitled.speed import forecast
+
+
+class Item(NamedTuple):
+    """One thing that is in a file."""
+
+    name: str  # "" for a remark
+    text: str
+    figures: Any  # the same for JSON; dictionaries of the same name are one
+
+
+def check(path: Path, overrides: Sequence[str] = ()) -> str:
+    """Contents and remarks of a mesh file or of a deck (TOML), a line each; errors as `figures`."""
+    return "\n".join(f"{item.name:16} {item.text}" if item.name else item.text for item in _items(path, overrides))
+
+
+def figures(path: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
+    """Contents and remarks of a mesh file or of a deck (TOML); InputError if it cannot be computed with."""
+    found: dict[str, Any] = {"remarks": []}
+    for name, _, value in _items(path, overrides):
+        key = name.replace(" ", "_") or "remarks"
+        if isinstance(value, dict):
+            found.setdefault(key, {}).update(value)
+        elif key in ("remarks", "fixed", "displaced"):
+            found.setdefault(key, []).append(value)
+        else:
+            found[key] = value
+    return found
+
+
+def _items(path: Path, overrides: Sequence[str]) -> Iterator[Item]:
+    if path.suffix.lower() == ".toml":
+        return _deck(load_deck(path, overrides))
+    if overrides:
+        raise InputError(f"{path}: is a mesh and has no keys to override; leave out --set")
+    return _file(meshes.read_file(path))
+
+
+def _deck(deck: Deck) -> Iterator[Item]:
+    mesh = preprocess.read_mesh(deck)
+    model = preprocess.discretise(deck, mesh)
+    efg = mesh.n_nodes - mesh.n_fe_nodes
+    yield Item(
+        "nodes",
+        f"{mesh.n_nodes} ({mesh.n_fe_nodes} FE, {efg} EFG)",
+        {"all": mesh.n_nodes, "fe": mesh.n_fe_nodes, "efg": efg},
+    )
+    yield Item("hexahedra", f"{len(mesh.hexahedra)}", len(mesh.hexahedra))
+    n_points, volume = len(mesh.integration_points), float(mesh.integration_volumes.sum() * 1e9)
+    yield Item("integration", f"{n_points} points, {volume:.6g} mm3", {"points": n_points, "volume_mm3": volume})
+    yield _extent(mesh.points, 1e3, " mm")
+    yield from _sets("node set", mesh.node_sets)
+    yield from _sets("cell set", mesh.cell_sets)
+    counts = np.bincount(model.material, minlength=len(model.materials))
+    for material, n in zip(model.materials, counts.tolist(), strict=True):
+        text = (
+            f"{material.name}: E {material.youngs_modulus:g} Pa, nu {material.poissons_ratio:g}, "
+            f"{material.density:g} kg/m3, {n} cells"
+        )
+        yield Item("material", text, {material.name: asdict(material) | {"cells": n}})
+    yield from _constraints((*deck.constraints(), *mesh.constraints), mesh.node_sets, 1e3, " mm")
+    if deck.tumour:
+        n = len(mesh.node_sets[preprocess.TUMOUR])
+        yield Item("grows", f"tumour ({n} nodes)", {"tumour": n})
+    n, of = len(model.prescribed_dofs), 3 * model.n_nodes
+    yield Item("prescribed dofs", f"{n} of {of}", n)
+    expected = forecast.forecast(deck, model)
+    yield Item("run", expected.describe(), expected._asdict())
+    yield from _remarks(plausible(deck))
+    yield from _remarks(model.remarks)
+
+
+def plausible(deck: Deck) -> Iterator[str]:
+    """Warnings of figures that are possible, but look like a slip of the unit."""
+    for section in deck.materials:
+        name, modulus = f"material.{section.name}", section.youngs_modulus
+        if not 1 <= modulus <= 1e12:
+            yield f"warning: {name}.youngs_modulus = {modulus:g}: is it in Pa? Brain tissue has about 3000"
+        if not 100 <= section.density <= 25000:
+            yield f"warning: {name}.density = {section.density:g}: is it in kg/m3? Tissue has about 1000"
+
+
+def _file(file: MeshFile) -> Iterator[Item]:
+    """A mesh file alone: as an FE mesh if it has hexahedra, else as what it can be, in its own units."""
+    remarks = list(_file_checks(file))
+    yield Item("format", str(file.format), str(file.format))
+    yield Item("nodes", f"{len(file.points)}", len(file.points))
+    kinds: dict[str, int] = {}
+    for block in file.cells:
+        kind = f"{block.kind} ({block.type})" if block.kind != "other" else block.type
+        kinds[kind] = kinds.get(kind, 0) + len(block.ids)
+    for kind, n in kinds.items():
+        yield Item("cells", f"{kind}: {n}", {kind: n})
+    yield _extent(file.points, 1.0, "")
+    yield from _sets("node set", file.node_sets)
+    yield from _sets("cell set", file.cell_sets)
+    for name, material in file.materials:
+        density = "none" if material.density is None else f"{material.density:g}"
+        text = (
+            f"{material.name} in {name}: E {material.youngs_modulus:g}, nu {material.poissons_ratio:g}, "
+            f"density {density}"
+        )
+        yield Item("material", text, {material.name: {"cells": name, "of_file": text}})
+    yield from _constraints(file.constraints, file.node_sets, 1.0, "")
+    yield from _remarks(dict.fromkeys(remarks))
+
+
+def _remarks(texts: Iterable[str]) -> Iterator[Item]:
+    yield from (Item("", text, text) for text in texts)
+
+
+def _file_checks(file: MeshFile) -> Iterator[str]:
+    kinds = {block.kind for block in file.cells if len(block.ids)}
+    if "hexahedron" in kinds and not kinds & {"tetrahedron", "wedge", "pyramid"}:
+        section = MeshFiles(fe=file.path)
+        mesh = meshes.assemble(section, file, None)
+        deck = Deck(mesh=section, path=file.path)
+        dofs = preprocess.prescribe(deck, mesh)[0] if mesh.constraints else np.empty(0, np.int64)
+        yield from mesh.remarks
+        none = np.empty((0, 8), np.int64)
+        said = checks.scene_remarks(mesh.points, mesh.hexahedra, none, mesh.n_fe_nodes, dofs)
+        yield from said if len(dofs) else [remark for remark in said if "rigid" not in remark]
+    else:
+        meshes.check_solids(file)
+        yield from file.remarks
+        yield from meshes.check_cloud(file)
+        yield (
+            f"warning: {file.path}: has {'no hexahedra' if 'hexahedron' not in kinds else 'more than hexahedra'}; it "
+            "may be mesh.efg" + (", and mesh.fe if mesh.dropped names the rest" if "hexahedron" in kinds else "")
+        )
+    if not file.constraints:
+        yield f"warning: {file.path}: fixes and displaces nothing; the deck has to"
+
+
+def _extent(points: NDArray[np.float64], scale: float, unit: str) -> Item:
+    ends = np.stack([points.min(axis=0), points.max(axis=0)], axis=1) * scale
+    text = ", ".join(f"{axis} {low:.6g} to {high:.6g}" for axis, (low, high) in zip("xyz", ends, strict=True))
+    return Item("extent", text + unit, dict(zip("xyz", ends.tolist(), strict=True)))
+
+
+def _sets(kind: str, sets: dict[str, NDArray[np.int64]]) -> Iterator[Item]:
+    for name, members in sets.items():
+        yield Item(kind, f"{name}: {len(members)}", {name: len(members)})
+
+
+def _constraints(
+    constraints: Iterable[Constraint], node_sets: dict[str, NDArray[np.int64]], scale: float, unit: str
+) -> Iterator[Item]:
+    for constraint in constraints:
+        axes = ", ".join("xyz"[direction] for direction in constraint.directions)
+        n = len(node_sets.get(constraint.node_set, ()))
+        name, text = "fixed", f"{constraint.node_set} ({n} nodes) in {axes}"
+        if any(isinstance(value, np.ndarray) or value for value in constraint.displacement):
+            moves = ", ".join(_moved(value, scale) for value in constraint.displacement)
+            name, text = "displaced", f"{text} by {moves}{unit}"
+        yield Item(name, text, text)
+
+
+def _moved(value: float | NDArray[np.float64], scale: float) -> str:
+    if isinstance(value, np.ndarray):
+        return f"{value.min() * scale:.6g} to {value.max() * scale:.6g}"
+    return f"{value * scale:.6g}"
