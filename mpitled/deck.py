@@ -183,7 +183,7 @@ class Cloud:
 class Support:
     """Support domains of the integration points."""
 
-    nodes: int = key("nodes in a support domain, n; the paper: 8", 12, limits="[4, inf)")
+    nodes: int = key("nodes in a support domain, n; the paper: 8", 20, limits="[4, inf)")
     basis: Literal[4, 10, 20] = key("monomials of the basis, m: linear, quadratic, cubic", 4)
     weight: Literal["equal", "quartic"] = key("weight of the moving least squares; the paper: equal", "quartic")
     max_fe_nodes: int = key("most FE nodes in a support domain", 7, limits="[0, inf)")
@@ -258,11 +258,15 @@ class Solver:
     """Explicit time integration."""
 
     method: Literal["quasi-static", "dynamic-relaxation", "dynamic"] = key(
-        "slow loading; damped steps to the static solution; or waves, with the true masses", "quasi-static"
+        "slow loading; damped steps to the static solution; or waves, with the true masses", "dynamic-relaxation"
     )
     load_time: float = key("quasi-static, dynamic: duration of the load", 2.0, "s", "(0, inf)")
     hold_time: float = key("quasi-static, dynamic: duration after it, at full load", 0.0, "s", "[0, inf)")
-    load_steps: int = key("dynamic-relaxation: steps in which the load grows", 500, limits="[1, inf)")
+    load_steps: Literal["auto"] | int = key(
+        "dynamic-relaxation: steps of the load; auto: what cells beside moved nodes need, more if one inverts",
+        "auto",
+        limits="[1, inf)",
+    )
     tolerance: float = key("dynamic-relaxation ends this near to the static solution", 0.01, "mm", "(0, inf)")
     time_step: Literal["auto"] | float = key(
         "time step, at most; auto: the longest stable one times safety", "auto", "s", "(0, inf)"

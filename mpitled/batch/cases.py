@@ -55,7 +55,7 @@ class Case:
         speed = max((section.material.wave_speed for section in deck.materials), default=1.0)
         steps = (solver.load_time + solver.hold_time) * speed / edge
         if solver.method == "dynamic-relaxation":
-            steps = solver.load_steps
+            steps = 200.0 if solver.load_steps == "auto" else solver.load_steps
         # What grows more is stiffer next to the tumour, and takes longer.
         growth = sphere_radius(deck.tumour.volume) / deck.tumour.seed_radius if deck.tumour else 1.0
         return cells * steps * (1 + growth)

@@ -49,6 +49,7 @@ class March:
     ) -> None:
         """halo sums one component; model: figures of the preprocessor."""
         self.sub, self.world, self.halo, self.solver, self.safety = sub, world, halo, solver, solver.safety
+        self.recovers = solver.on_inversion == "recover"
         self.scales_mass = solver.mass_scaling and solver.method == "quasi-static"
         self.typical = model["critical_step_typical_s"]  # by the bound
         self.end = solver.load_time + solver.hold_time

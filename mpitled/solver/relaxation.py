@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from copy import copy, deepcopy
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,11 @@ from mpitled.solver.survey import Survey
 BETWEEN = 10
 #: A mass tensor's trace falls to no less than this share from one survey to the next.
 KEEP = 0.9
-#: The estimate has to hold at so many surveys in a row.
-SETTLED = 3
+#: The estimate has to hold for so many steps, and the lowest eigenvalue to change by less than this share in BETWEEN of
+#: them: it falls while the quick modes that hide the slow ones die.
+SETTLED, STEADY = 50, 0.1
+#: At most so much would a cell next to moved nodes be strained in a step, if nothing gave way (`load_steps` = "auto").
+STRAIN_PER_STEP = 0.1
 #: It has stalled when so many surveys in a row have not brought the least estimate down by this factor: round-off.
 STALLED, BETTER = 300, 0.99
 
@@ -52,8 +56,10 @@ class Relaxation:
         """halo sums six components."""
         self.sub, self.halo, self.safety, self.frames = sub, halo, solver.safety, frames
         self.tolerance = solver.tolerance
+        # Where the pace is its own, it is for it to find a slower one.
+        self.recovers = solver.on_inversion == "recover" or solver.load_steps == "auto"
         self.between = BETWEEN
-        self.load_time = float(solver.load_steps)
+        self.load_time = self._load_steps(solver.load_steps, world)
         self.state = at_rest(sub, self.load_time, 1.0)
         self.state.mass = np.zeros((6, sub.n_nodes))
         self.state.mobility = np.zeros((6, sub.n_nodes))
@@ -66,6 +72,17 @@ class Relaxation:
         self.best, self.waited = math.inf, 0
         self.forces, self.motion = compose_forces(sub, force_halo), compose_relaxation(sub, self.counted)
         self.sharpness = Sharpness(sub, world, self.forces, self.free)
+
+    def _load_steps(self, given: Literal["auto"] | int, world: World) -> float:
+        """Steps in which the load grows. Collective.
+
+        A step carries motion about one cell farther, whatever the cell: what counts is the speed of moved nodes, at its
+        largest 15/8 of the mean on the loading curve, in cells a step. The load takes no less than five surveys.
+        """
+        if given != "auto":
+            return float(given)
+        steepest = float(world.gather([self.sub.steepest_load()]).max())
+        return max(5.0 * BETWEEN, math.ceil(15 / 8 * steepest / STRAIN_PER_STEP))
 
     def start_from(self, s: State, energy: float) -> None:
         """Go on from the displacements of another run at the end of its load, at rest; `energy` (J) is in its cells."""
@@ -164,16 +181,16 @@ class Relaxation:
         """Damping of the next steps; whether a frame is due now, and whether the static solution is reached."""
         s = self.state
         known = figures["rayleigh_force"] / figures["rayleigh_mass"] if figures["rayleigh_mass"] > 0 else 0.0
-        loaded = s.share >= 1
+        loaded, steady = s.share >= 1, False
         if loaded and known > 0:
-            steady = abs(known - self.lowest) < 0.3 * self.lowest
+            steady = abs(known - self.lowest) < STEADY * self.between / BETWEEN * self.lowest
             self.lowest = known
             frequency = math.sqrt(known)
             self.distance = max(figures["change"] / frequency, figures["residual"] / known)
-            self.settled = self.settled + 1 if steady and self.distance < self.tolerance else 0
+            self.settled = self.settled + self.between if steady and self.distance < self.tolerance else 0
         damping = 2 * math.sqrt(self.lowest)
         s.retain, s.gain = (2 - damping) / (2 + damping), 2 / (2 + damping)
-        if self.distance < BETTER * self.best:
+        if steady and self.distance < BETTER * self.best:
             self.best, self.waited = self.distance, 0
         self.waited += loaded
         if self.settled >= SETTLED or self.stalled:

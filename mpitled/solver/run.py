@@ -283,7 +283,7 @@ class _Run:
                     self._write(writer, method.frame_time)
             if last:
                 return
-            if self.deck.solver.on_inversion == "recover" and (due or look % SAVED == 0):
+            if method.recovers and (due or look % SAVED == 0):
                 if due:
                     saved.clear()  # what is written stays
                 saved.append({name: deepcopy(getattr(method, name)) for name in method.REMEMBERED})

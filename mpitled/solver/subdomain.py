@@ -86,6 +86,32 @@ class Subdomain:
             free[held % 3, held // 3] = 0
         return free
 
+    def steepest_load(self) -> float:
+        """Largest gradient that the full load's speed, m per load, has in a cell of this rank whose free nodes rest.
+
+        It is by how much of its own size a cell next to moving nodes would be strained, if nothing gave way.
+        """
+        rows, speed = self.rows, np.zeros((self.n_nodes, 3))
+        velocity = self.moving_full
+        if self.moving_turns is not None:
+            angle, arm, across = self.moving_turns.T
+            velocity = velocity - ((np.cos(angle) - 1) * arm + np.sin(angle) * across) + angle * across
+        speed.reshape(-1)[self.moving] = velocity
+        moves: NDArray[np.bool_] = np.any(speed, axis=1)
+        steepest = 0.0
+        for nodes in (rows.hexahedra, rows.domains):
+            cells = np.searchsorted(rows.nodes, nodes)
+            near = moves[cells].any(axis=1)
+            if near.any():
+                gradients = (
+                    hexahedra.geometry(rows.points, cells[near])[0]
+                    if nodes is rows.hexahedra
+                    else rows.domain_gradients[near]
+                )
+                found = np.einsum("cai,caj->cij", speed[cells[near]], gradients)
+                steepest = max(steepest, float(np.sqrt((found**2).sum(axis=(1, 2)).max())))
+        return steepest
+
 
 def localise(
     rows: PartRows, hourglass: float, stabilisation: float, rule: str, precision: type[np.floating] = np.float64
