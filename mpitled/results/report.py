@@ -49,6 +49,11 @@ class Outcome:
     figures: dict[str, Any]  # what it ended with; empty if it was killed
 
     @property
+    def title(self) -> str:
+        """Of the scene; there is always one."""
+        return self.metadata.get("title") or "mpitled"
+
+    @property
     def seed(self) -> NDArray[np.int64]:
         """Nodes on the surface of the tumour; none without one."""
         return self.model.node_sets.get("tumour", np.empty(0, np.int64))
@@ -58,6 +63,13 @@ class Outcome:
         """The tumour's centre (3,), m."""
         tumour = self.metadata.get("tumour")
         return np.array(tumour["centre_m"]) if tumour else None
+
+    @property
+    def moved(self) -> NDArray[np.float64]:
+        """(n_nodes, 3), m: the field, and the tumour's surface as prescribed."""
+        moved = self.field.copy()
+        moved[self.seed] = self.displacement[self.seed]
+        return moved
 
 
 def write(directory: Path, seconds: Mapping[str, float] | None = None) -> dict[str, Any]:
@@ -271,12 +283,10 @@ def _draw(outcome: Outcome, directory: Path) -> list[str] | str:
     except ImportError:
         return "none, for matplotlib is missing; install it: pip install 'mpitled[pictures]'"
     from mpitled.results import plot
+    from mpitled.results.solid import solid_of
 
-    moved = outcome.field.copy()
-    moved[outcome.seed] = outcome.displacement[outcome.seed]  # the tumour's surface as prescribed
-    title = outcome.metadata.get("title") or "mpitled"
     try:
-        return plot.draw(directory, outcome.model, moved, outcome.centre, title)
+        return plot.draw(directory, solid_of(outcome.model, outcome.moved), outcome.centre, outcome.title)
     except OSError as error:
         raise InputError(f"{directory}: pictures cannot be written ({error.strerror})") from None
 
