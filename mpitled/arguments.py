@@ -72,7 +72,11 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
 
     report = command("report", "table, report.json and pictures of a run; the table of a sweep", json=True)
     report.add_argument("directory", type=Path, help="the folder that a run or a sweep wrote")
+    report.add_argument("--html", action="store_true", help="also one page with all of it, report.html")
     _beside(report)
+
+    view = command("view", "a result in a window, to turn and to slide through")
+    view.add_argument("result", type=Path, help="the folder that a run wrote, or its result.vtkhdf")
 
     compare = command("compare", "errors of a result against a reference, in mm", json=True)
     compare.add_argument("result", type=Path, help="the folder that a run wrote")

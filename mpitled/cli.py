@@ -198,8 +198,20 @@ def _report(options: argparse.Namespace) -> int:
 
     if cases.is_sweep(options.directory):
         return _tabulate(cases.read(options.directory), options)
-    _print(report.write(options.directory), report.table, options)
+    if options.html:
+        from mpitled.results import page
+
+        _print(page.write(options.directory), report.table, options)
+        print(f"written to {options.directory / page.PAGE}", file=sys.stderr)
+    else:
+        _print(report.write(options.directory), report.table, options)
     return 0
+
+
+def _view(options: argparse.Namespace) -> None:
+    from mpitled.results import views
+
+    views.show(options.result)
 
 
 def _compare(options: argparse.Namespace) -> None:
@@ -292,6 +304,7 @@ _COMMANDS: dict[str, Callable[[argparse.Namespace], int | None]] = {
     "build": _build,
     "partition": _partition,
     "report": _report,
+    "view": _view,
     "compare": _compare,
     "study": _study,
     "stability": _stability,

@@ -11,7 +11,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from types import UnionType
@@ -717,6 +717,14 @@ def canonical(deck: Deck) -> dict[str, Any]:
         return table
 
     return plain(deck)
+
+
+def recorded(table: Mapping[str, Any], path: Path) -> Deck:
+    """The deck that `canonical` told so, without its geometry and its motion, whose files may be gone by now."""
+    without = (*GEOMETRIES, "fixed", "displaced")
+    kept = {name: section for name, section in table.items() if name not in without}
+    deck: Deck = _section(Deck, kept, "", _Source(path, frozenset()), {"path": path})
+    return deck
 
 
 _MODEL = (*GEOMETRIES, "tumour", "cloud", "support", "hexahedra", "spheres", "materials", "fixed", "displaced")

@@ -62,4 +62,4 @@ def test_every_kernel_is_either_taken_or_left_out_for_a_reason(tmp_path):
     deck = tmp_path / "scene.toml"
     deck.write_text(SCENE.format(cloud="none"))
     scene = load_deck(deck)
-    assert set(reasons(scene, prepare(scene, tmp_path, World()).sub, World())) == set(kernel_names())
+    assert set(reasons(scene, prepare(scene, tmp_path, World()).sub, 1)) == set(kernel_names())

@@ -21,7 +21,7 @@ OWNERS = {
     "h5py": {"mpitled.store"},
     "mpi4py": {"mpitled.solver.halo"},
     "pymetis": {"partition.metis"},
-    "pyvista": {"mpitled.interface"},
+    "pyvista": {"mpitled.results.views"},
     "xarray": {"mpitled.interface"},
     "argcomplete": {"mpitled.cli"},
 }

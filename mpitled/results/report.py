@@ -173,7 +173,7 @@ def table(report: Mapping[str, Any]) -> str:
     lines = [report["title"]] if report["title"] else []
     if not report["complete"]:
         lines.append(f"not complete: {report['load_share']:.1%} of the load time")
-    lines += [f"  {name:<40}  {value}" for name, value in _rows(report)]
+    lines += [f"  {name:<40}  {value}" for name, value in rows(report)]
     lines += [f"  warning: {text}" for text in report["warnings"]]
     pictures = report["pictures"]
     lines.append(f"  {'pictures':<40}  {', '.join(pictures) if isinstance(pictures, list) else pictures}")
@@ -336,7 +336,8 @@ _LINES = (
 )
 
 
-def _rows(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def rows(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Name and value of each line of the table."""
     for key, name, form in _LINES:
         value: Any = report
         for part in key.split("."):

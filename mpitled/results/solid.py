@@ -6,7 +6,7 @@ tetrahedra of its nodes (its support domains overlap and have no shape of their 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -40,7 +40,6 @@ class Solid:
 def solid_of(model: Model, displacement: NDArray[np.float64]) -> Solid:
     """The solid of a model whose nodes have these displacements (n_nodes, 3), m."""
     points, n, none = 1e3 * model.points, model.n_nodes, np.empty(0, np.int64)
-    displacement = 1e3 * displacement
     cells = model.hexahedra
     walls = {}
     for name in ("left_ventricle", "right_ventricle"):
@@ -51,8 +50,8 @@ def solid_of(model: Model, displacement: NDArray[np.float64]) -> Solid:
     seed, interface = (model.node_sets.get(name, none) for name in ("tumour", "interface"))
     cloud = _cloud(model, points, seed, interface)
     return Solid(
-        points=np.concatenate([points, points[cells].mean(axis=1)]),
-        displacement=np.concatenate([displacement, displacement[cells].mean(axis=1)]),
+        points=_with_centres(points, cells),
+        displacement=_with_centres(1e3 * displacement, cells),
         hexahedra=cells,
         centres=np.arange(n, n + len(cells)),
         cloud=cloud,
@@ -61,6 +60,15 @@ def solid_of(model: Model, displacement: NDArray[np.float64]) -> Solid:
         tumour=seed[ConvexHull(points[seed]).simplices] if len(seed) else np.empty((0, 3), np.int64),
         surface=_surface(model, cloud, seed, interface),
     )
+
+
+def displaced(solid: Solid, displacement: NDArray[np.float64]) -> Solid:
+    """The same with other displacements (n_nodes, 3), m, of its nodes."""
+    return replace(solid, displacement=_with_centres(1e3 * displacement, solid.hexahedra))
+
+
+def _with_centres(values: NDArray[np.float64], hexahedra: NDArray[np.int64]) -> NDArray[np.float64]:
+    return np.concatenate([values, values[hexahedra].mean(axis=1)])
 
 
 def _cloud(
@@ -79,7 +87,10 @@ def _cloud(
 def _surface(
     model: Model, cloud: NDArray[np.int64], seed: NDArray[np.int64], interface: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Triangles (n, 3) of hexahedra and of the cloud that are of one cell alone, without interface and tumour."""
+    """Triangles (n, 3) of hexahedra and of the cloud that are of one cell alone, without interface and tumour.
+
+    Tetrahedra next to the interface may end short of it: their triangles are left out with the others there.
+    """
     inside = np.zeros(model.n_nodes, bool)
     inside[interface] = inside[seed] = True
     faces = boundary_faces(model.hexahedra)
@@ -87,7 +98,7 @@ def _surface(
     corners = np.concatenate([cloud[:, list(three)] for three in combinations(range(4), 3)])
     _, first, count = np.unique(np.sort(corners, axis=1), axis=0, return_index=True, return_counts=True)
     of_cloud = corners[first[count == 1]]
-    return np.concatenate([of_hexahedra, of_cloud[~inside[of_cloud].all(axis=1)]])
+    return np.concatenate([of_hexahedra, of_cloud[~inside[of_cloud].any(axis=1)]])
 
 
 def triangles_of(faces: NDArray[np.int64]) -> NDArray[np.int64]:
