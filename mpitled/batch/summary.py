@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import html
 import json
 import math
 import sys
@@ -16,6 +15,7 @@ from mpitled.batch import launch
 from mpitled.batch.cases import Sweep
 from mpitled.deck import unit_of
 from mpitled.errors import InputError
+from mpitled.results import markup
 
 Row = dict[str, float | str]
 
@@ -253,26 +253,17 @@ def _label(row: Row, keys: Sequence[str]) -> str:
     return " ".join(f"{row[key]:g}" if isinstance(row[key], float) else str(row[key]) for key in keys)
 
 
-_PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
-body {{ font-family: sans-serif; margin: 2em; color: #222 }}
-table {{ border-collapse: collapse }}
-th, td {{ padding: 0.3em 0.7em; text-align: right; border-bottom: 1px solid #ccc }}
-img {{ max-width: 100%; display: block; margin-top: 1.5em }}
-</style></head><body>
-<h1>{title}</h1>
-<table>
-{rows}
-</table>
-{images}
-</body></html>
-"""
-
-
 def _html(sweep: Sweep, table: Table, charts: Sequence[Path]) -> str:
+    """A page that is one file: the table, and the charts."""
     headings, lines = _rendered(table)
-    rows = ["<tr>" + "".join(f"<th>{html.escape(cell)}</th>" for cell in headings) + "</tr>"]
-    rows += ["<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in line) + "</tr>" for line in lines]
-    images = [f'<img src="{path.name}" alt="{path.stem}">' for path in charts]
-    title = html.escape(sweep.cases[0].deck.title or sweep.deck.stem)
-    return _PAGE.format(title=title, rows="\n".join(rows), images="\n".join(images))
+    title, n = sweep.cases[0].deck.title or sweep.deck.stem, len(sweep.cases)
+    alt = {
+        "quantities": f"Charts of the results against {table.keys[0]}",
+        "cost": "Chart of the error estimate in mm against the time of the loop in s",
+    }
+    parts = {
+        "Results": [markup.table(headings, lines)],
+        "Charts": [markup.picture(path.read_bytes(), alt[path.stem]) for path in charts],
+    }
+    head = [markup.text(f"{n} cases of {sweep.deck.name}, varied: {', '.join(table.keys)}", "faint")]
+    return markup.page(title, head, list(parts.items()))

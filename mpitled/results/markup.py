@@ -10,6 +10,7 @@ _PAGE = """<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="{policy}">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <link rel="icon" href="data:,">
 <title>{title}</title>
@@ -22,6 +23,8 @@ _PAGE = """<!DOCTYPE html>
 </body>
 </html>
 """
+#: Browsers see to it that a page is one file.
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 _STYLE = """\
 :root { --ink: #1f2328; --faint: #57606a; --line: #d0d7de; --ground: #f6f8fa; --accent: #0b5cad; }
 * { box-sizing: border-box; }
@@ -69,7 +72,7 @@ def page(title: str, head: Sequence[str], sections: Sequence[tuple[str, Sequence
     body.append("</header>")
     for i, (heading, parts) in enumerate(filled):
         body += [f'<section id="s{i}"><h2>{escape(heading)}</h2>', *parts, "</section>"]
-    return _PAGE.format(title=escape(title), style=_STYLE, body="\n".join(body))
+    return _PAGE.format(title=escape(title), policy=POLICY, style=_STYLE, body="\n".join(body))
 
 
 def text(words: str, kind: str = "") -> str:

@@ -73,7 +73,7 @@ def _page(directory: Path, made: Mapping[str, Any]) -> str:
         ("Cross-sections", _cross_sections(run)),
         ("In three dimensions", _in_space(run)),
         ("Displacement", _displacement(run)),
-        ("Tumour's volume", _balance(run)),
+        ("Volume balance", _balance(run)),
         ("Through the run", _history(run)),
         ("Run time", _time(run)),
         ("All figures", _figures(run)),
@@ -93,7 +93,7 @@ def _head(run: _Run) -> Iterator[str]:
         f"{method}, computed by mpitled {versions['mpitled']} on {ranks} rank{'s' if ranks > 1 else ''}", "faint"
     )
     if not made["complete"]:
-        yield markup.note([f"The run is not complete: what is here is at {made['load_share']:.1%} of the load time."])
+        yield markup.note([f"The run is {report.incomplete(made)}."])
     if made["warnings"]:
         yield markup.note([f"Warning: {warning}." for warning in made["warnings"]])
     if not run.draws:
@@ -219,7 +219,7 @@ def _displacement(run: _Run) -> Iterator[str]:
             ],
             caption="Volume of the ventricles",
         )
-    if run.draws:
+    if run.draws and made["max_displacement_mm"] > 0:
         from mpitled.results import charts
 
         field = run.outcome.field
@@ -235,9 +235,9 @@ def _displacement(run: _Run) -> Iterator[str]:
 
 
 def _balance(run: _Run) -> Iterator[str]:
-    if not (balance := run.report.get("volume_balance")):
+    balance = run.report.get("volume_balance", {})
+    if (grown := balance.get("tumour_added_mm3", 0.0)) <= 0:
         return
-    grown = balance["tumour_added_mm3"]
     found = {
         "pushed through the interface": balance["pushed_through_interface_mm3"],
         "compression of the cloud": balance["elastic_compression_mm3"],
@@ -258,7 +258,7 @@ def _balance(run: _Run) -> Iterator[str]:
 def _history(run: _Run) -> Iterator[str]:
     """At the frames that were written: more of them with output.frames."""
     if len(run.times) < 2:
-        yield markup.text("There is one frame only; output.frames in the deck asks for more.")
+        yield markup.text("One frame was written, the undeformed body: there is nothing to show over time yet.")
         return
     label = "share of the load (1)" if run.relaxed else "time (s)"
     if run.draws:

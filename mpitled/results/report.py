@@ -168,11 +168,17 @@ def _warnings(report: Mapping[str, Any], ramped: bool) -> list[str]:
     return found
 
 
+def incomplete(report: Mapping[str, Any]) -> str:
+    """What there is of a run that did not come to its end, and why, if it could say so."""
+    stopped = f": {report['stopped']}" if "stopped" in report else ""
+    return f"not complete: {report['load_share']:.1%} of the load time{stopped}"
+
+
 def table(report: Mapping[str, Any]) -> str:
     """The report for people to read; what is absent there is absent here."""
     lines = [report["title"]] if report["title"] else []
     if not report["complete"]:
-        lines.append(f"not complete: {report['load_share']:.1%} of the load time")
+        lines.append(incomplete(report))
     lines += [f"  {name:<40}  {value}" for name, value in rows(report)]
     lines += [f"  warning: {text}" for text in report["warnings"]]
     pictures = report["pictures"]

@@ -7,7 +7,6 @@ tetrahedra of its nodes (its support domains overlap and have no shape of their 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,15 +88,21 @@ def _surface(
 ) -> NDArray[np.int64]:
     """Triangles (n, 3) of hexahedra and of the cloud that are of one cell alone, without interface and tumour.
 
-    Tetrahedra next to the interface may end short of it: their triangles are left out with the others there.
+    Anticlockwise seen from outside. Tetrahedra next to the interface may end short of it: their triangles there are
+    left out too.
     """
     inside = np.zeros(model.n_nodes, bool)
     inside[interface] = inside[seed] = True
     faces = boundary_faces(model.hexahedra)
     of_hexahedra = triangles_of(faces[~inside[faces].all(axis=1)])
-    corners = np.concatenate([cloud[:, list(three)] for three in combinations(range(4), 3)])
-    _, first, count = np.unique(np.sort(corners, axis=1), axis=0, return_index=True, return_counts=True)
-    of_cloud = corners[first[count == 1]]
+    # Each tetrahedron without one of its corners in turn, which lies behind the others.
+    behind = np.concatenate([np.roll(cloud, -k, axis=1) for k in range(4)])
+    _, first, count = np.unique(np.sort(behind[:, 1:], axis=1), axis=0, return_index=True, return_counts=True)
+    behind = behind[first[count == 1]]
+    last, a, b, c = np.moveaxis(model.points[behind], 1, 0)
+    inwards = (np.cross(b - a, c - a) * (last - a)).sum(axis=1) > 0
+    behind[inwards, 1:3] = behind[inwards, 2:0:-1]
+    of_cloud = behind[:, 1:]
     return np.concatenate([of_hexahedra, of_cloud[~inside[of_cloud].any(axis=1)]])
 
 
