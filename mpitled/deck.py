@@ -31,7 +31,7 @@ _PER_SI = {"mm": 1e3, "mm3": 1e9, "degrees": 180 / math.pi}
 
 
 class _Key(NamedTuple):
-    """What the parser, the messages and the README say of a key; its type is the annotation of its field."""
+    """What the parser, the messages and the guide say of a key; its type is the annotation of its field."""
 
     meaning: str
     unit: str
@@ -803,7 +803,7 @@ def unit_of(name: str) -> str:
 
 
 def markdown_table() -> str:
-    """The table of all keys for the README."""
+    """The table of all keys for the guide, jobs/README.md."""
     lines = ["| key | value | unit | default | meaning |", "|---|---|---|---|---|"]
     for home, section, entry in _declared():
         if entry:

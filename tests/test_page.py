@@ -1,4 +1,4 @@
-"""The page of a run: in a real browser, with and without PyVista, of brains, of shapes, and of runs that stopped."""
+"""The page of a run: in a real browser, with and without PyVista, of a brain and of a shape that was stopped."""
 
 from __future__ import annotations
 
@@ -19,34 +19,8 @@ from mpitled.results import page, report
 pytest.importorskip("matplotlib")
 pytest.importorskip("nibabel")
 
-BRAIN = f"""
-title = "A coarse brain <with> a tumour & more"
-[labels]
-image = "{ROOT / "jobs" / "data" / "mni152_labels_2mm.nii.gz"}"
-element_size = 7.0
-[tumour]
-centre = [-26.0, -70.0, 3.0]
-volume = 268.1
-surface_nodes = 400
-[cloud]
-growth = 0.35
-[material.brain]
-youngs_modulus = 3000.0
-poissons_ratio = 0.49
-cells = ["tissue"]
-[material.csf]
-youngs_modulus = 10.0
-poissons_ratio = 0.1
-cells = ["left_ventricle", "right_ventricle"]
-[[fixed]]
-nodes = "skull"
-[solver]
-method = "dynamic-relaxation"
-load_steps = 250
-[output]
-frames = 4
-"""
 CYLINDER = """
+title = "A cylinder <squeezed> & more"
 [cylinder]
 radius = 20.0
 height = 40.0
@@ -72,13 +46,19 @@ SECTIONS = {
 
 
 @pytest.fixture(scope="module")
-def brain(tmp_path_factory):
-    """The folder of a run with its page, and every figure that was drawn for it."""
+def brain(segmentation):
+    """The folder of a run with its page."""
+    return segmentation[0] / "trial"
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """The folder of a run that cannot go on, with its page, and every figure that was drawn for it without PyVista."""
     from matplotlib.figure import Figure
 
-    folder = tmp_path_factory.mktemp("brain")
-    (folder / "brain.toml").write_text(BRAIN)
-    mpitled("run", folder / "brain.toml", "-q", "--out", folder / "out", "--set", "output.pictures=false")
+    folder = tmp_path_factory.mktemp("stopped")
+    (folder / "cylinder.toml").write_text(CYLINDER)
+    mpitled("run", folder / "cylinder.toml", "-q", "--out", folder / "out", status=3)
     drawn, save = [], Figure.savefig
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", lambda self, *to, **how: (drawn.append(self), save(self, *to, **how)))
@@ -87,41 +67,31 @@ def brain(tmp_path_factory):
     return folder / "out", drawn
 
 
-@pytest.fixture(scope="module")
-def stopped(tmp_path_factory):
-    """The folder of a run that cannot go on, with its page."""
-    folder = tmp_path_factory.mktemp("stopped")
-    (folder / "cylinder.toml").write_text(CYLINDER)
-    mpitled("run", folder / "cylinder.toml", "-q", "--out", folder / "out", status=3)
-    mpitled("report", folder / "out", "--html")
-    return folder / "out"
-
-
 def sections(out):
     return set(re.findall(r"<h2>(.*?)</h2>", (out / page.PAGE).read_text()))
 
 
 def test_a_page_has_what_the_scene_has(brain, stopped):
-    out, _ = brain
-    assert sections(out) == SECTIONS | {"Volume balance"}
-    text = (out / page.PAGE).read_text()
-    assert "A coarse brain &lt;with&gt; a tumour &amp; more" in text
-    made = report.write(out)
+    assert sections(brain) == SECTIONS | {"Volume balance"}
+    text, made = (brain / page.PAGE).read_text(), report.compute(report.read(brain))
     for value in (f"{made['ventricle_volume_change_ml']['left']:+.3f}", f"{made['tumour_volume_mm3']:.1f} mm"):
         assert value in text
+    assert made["warnings"]
     for warning in made["warnings"]:
         assert warning in text
-    assert sections(stopped) == SECTIONS
-    assert "drawn by matplotlib (PyVista found no way to draw here)" in text
-    text = (stopped / page.PAGE).read_text()
+
+    out, _ = stopped
+    assert sections(out) == SECTIONS
+    text = (out / page.PAGE).read_text()
+    assert "A cylinder &lt;squeezed&gt; &amp; more" in text
     assert re.search(r"not complete: [\d.]+% of the load time: unstable at .*worst is", text)
-    assert "A coarse brain" not in text
+    assert "drawn by matplotlib (PyVista found no way to draw here)" in text
     assert "pack, clear, unpack: one rank" in text
 
 
 @pytest.mark.parametrize("width", [1250, 600])
 def test_a_browser_shows_it_all_and_asks_for_nothing(tmp_path, brain, stopped, width):
-    for out, n_pictures in ((brain[0], 7), (stopped, 6)):
+    for out, n_pictures in ((brain, 7), (stopped[0], 6)):
         answer = shown(out / page.PAGE, width, tmp_path)
         assert answer["said"] == answer["fetched"] == []
         assert len(answer["pictures"]) == n_pictures
@@ -133,7 +103,7 @@ def test_a_browser_shows_it_all_and_asks_for_nothing(tmp_path, brain, stopped, w
 
 def test_a_page_with_faults_is_found_out(tmp_path, stopped):
     """What the test above would not overlook."""
-    text = (stopped / page.PAGE).read_text()
+    text = (stopped[0] / page.PAGE).read_text()
     bad = tmp_path / "bad.html"
     wrong = '<img alt="x" src="https://example.org/x.png"><p style="margin-top:-9rem; min-width:5000px">over it</p>'
     bad.write_text(text.replace("</figure>", "</figure>" + wrong, 1))
@@ -144,11 +114,11 @@ def test_a_page_with_faults_is_found_out(tmp_path, stopped):
     assert any("over it" in pair for pair in overlaps(answer))
 
 
-def test_words_in_the_pictures_do_not_overlap(monkeypatch, brain):
+def test_words_in_the_pictures_do_not_overlap(monkeypatch, stopped):
     from matplotlib.text import Text
 
-    _, drawn = brain
-    assert len(drawn) == 7
+    _, drawn = stopped
+    assert len(drawn) == 6
     for figure in drawn:
         boxes = []
 
@@ -176,20 +146,18 @@ def test_pyvista_draws_what_matplotlib_draws(tmp_path, brain):
 
     from mpitled.results import views
 
-    out, _ = brain
-    assert views.draw(out, tmp_path / "pyvista.png") == "PyVista"
-    views._draw(out, tmp_path / "matplotlib.png", views._painter)
+    assert views.draw(brain, tmp_path / "pyvista.png") == "PyVista"
+    views._draw(brain, tmp_path / "matplotlib.png", views._painter)
     dark = [imread(tmp_path / f"{name}.png")[:, :, :3].sum(axis=2) < 0.6 for name in ("pyvista", "matplotlib")]
     assert dark[0].shape == dark[1].shape
     assert dark[0].mean() == pytest.approx(dark[1].mean(), rel=0.1)
 
 
 def test_a_window_needs_a_screen_and_pyvista(brain):
-    out, _ = brain
     no_screen = {name: value for name, value in ENVIRONMENT.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
     code = "from mpitled.cli import main; main()"
     done = subprocess.run(
-        [sys.executable, "-c", code, "view", str(out)], env=no_screen, cwd=ROOT, capture_output=True, text=True
+        [sys.executable, "-c", code, "view", str(brain)], env=no_screen, cwd=ROOT, capture_output=True, text=True
     )
     assert done.returncode == 2
     assert "--html" in complaint(done)
