@@ -102,14 +102,14 @@ def _run(options: argparse.Namespace) -> None:
 
 
 def _sweep(options: argparse.Namespace) -> int:
-    from mpitled.batch import cases, sweep, vary
+    from mpitled.batch import cases, growth, sweep, vary
     from mpitled.solver.halo import World
     from mpitled.solver.run import everywhere
 
     world = World()
     with everywhere():  # each rank reads the same files
         if options.deck.is_dir():
-            if options.vary or options.cases or options.set or options.out or options.ranks:
+            if options.vary or options.cases or options.set or options.out or options.ranks or options.one_growth:
                 raise InputError(f"{options.deck}: goes on as it began; give the deck to vary, set or place it anew")
             plan = cases.read(options.deck)
         else:
@@ -117,12 +117,16 @@ def _sweep(options: argparse.Namespace) -> int:
                 raise InputError("sweep: nothing is varied; give --vary KEY=A,B,... or --cases CSV")
             values = vary.table(options.cases) if options.cases else vary.grid(options.vary)
             out = options.out or Path("out") / f"sweep_{options.deck.stem}"
-            plan = cases.plan(options.deck, values, options.set, options.ranks or 1, out)
+            plan = cases.plan(options.deck, values, options.set, options.ranks or 1, out, options.one_growth)
+        if plan.one_growth and (options.scheduler or options.only):
+            raise InputError("--one-growth: is one run, and no array of jobs; leave out --scheduler and --only")
     if options.scheduler:
         if world.leads:
             print(sweep.array_job(plan, options.scheduler))
         return 0
     sweep.compute(plan, world, jobs=options.jobs, retry=options.retry, only=options.only)
+    if plan.one_growth and world.leads:
+        growth.tell(plan)
     return _tabulate(plan, options) if world.leads and not options.only else 0
 
 

@@ -118,11 +118,11 @@ def text(table: Table) -> str:
     cells = [[*heading.split(", ")] for heading in headings]
     depth = max(map(len, cells))
     heads = [[(words + [""] * depth)[i] for words in cells] for i in range(depth)]
-    figures = [line for line in lines if not _is_remark(line)]
+    figures = [line for line in lines if not _is_remark(line, table)]
     widths = [max(len(line[i]) for line in (*heads, *figures)) for i in range(len(headings))]
     made = []
     for line in (*heads, *lines):
-        shown = line if not _is_remark(line) else [cell for cell in line if cell]
+        shown = line if not _is_remark(line, table) else [cell for cell in line if cell]
         made.append("  ".join(f"{cell:>{width}}" for cell, width in zip(shown, widths, strict=False)))
     return "\n".join(made)
 
@@ -194,6 +194,7 @@ def _rendered(table: Table) -> tuple[list[str], list[list[str]]]:
     columns = [c for c in _RENDERED if any((row | time)[c.name] != "" for row, time in _pairs(table))]
     headings = [f"{key}, {unit}" if (unit := unit_of(key)) else key for key in table.keys]
     headings += [*([""] if table.beside else []), *(column.heading for column in columns)]
+    headings += [] if columns else ["figures"]  # none: there is room for why
     lines = []
     for row, time in _pairs(table):
         values = [f"{row[key]:.10g}" if isinstance(row[key], float) else str(row[key]) for key in table.keys]
@@ -207,8 +208,9 @@ def _rendered(table: Table) -> tuple[list[str], list[list[str]]]:
     return headings, lines
 
 
-def _is_remark(line: list[str]) -> bool:
-    return len(line) > 3 and not any(line[-3:])
+def _is_remark(line: list[str], table: Table) -> bool:
+    """Whether it says why there are no figures."""
+    return any(row["failure"] and row["failure"] in line for row in table.rows)
 
 
 def _pairs(table: Table) -> Iterator[tuple[Row, Row]]:
@@ -242,7 +244,7 @@ def _draw(table: Table, folder: Path) -> list[Path]:
         label = f"{key}, {unit}" if (unit := unit_of(key)) else key
         charts.draw_quantities(families, key, label, quantities, folder / "quantities.png")
         made.append(folder / "quantities.png")
-    if timed := [row for row in rows if row["error_estimate_mm"] != ""]:
+    if timed := [row for row in rows if row["error_estimate_mm"] != "" and row["loop_s"] != ""]:
         points = [(float(row["loop_s"]), float(row["error_estimate_mm"]), _label(row, table.keys)) for row in timed]
         charts.draw_cost(points, folder / "cost.png")
         made.append(folder / "cost.png")
