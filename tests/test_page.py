@@ -153,6 +153,19 @@ def test_pyvista_draws_what_matplotlib_draws(tmp_path, brain):
     assert dark[0].mean() == pytest.approx(dark[1].mean(), rel=0.1)
 
 
+def test_what_holds_no_run_is_told_apart(tmp_path):
+    deck = tmp_path / "scene.toml"
+    deck.write_text(CYLINDER)
+    for path, words in (
+        (tmp_path / "nowhere", "is no folder; give the one that 'mpitled run' wrote"),
+        (deck, "is no folder"),
+        (tmp_path, "holds no result; give the folder"),
+    ):
+        assert words in complaint(mpitled("report", path, "--html", status=2))
+    for path, words in ((tmp_path / "nowhere", "there is no such file"), (tmp_path, "holds no result")):
+        assert words in complaint(mpitled("view", path, status=2))
+
+
 def test_a_window_needs_a_screen_and_pyvista(brain):
     no_screen = {name: value for name, value in ENVIRONMENT.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
     code = "from mpitled.cli import main; main()"

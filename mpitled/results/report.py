@@ -92,6 +92,8 @@ def write(directory: Path, seconds: Mapping[str, float] | None = None) -> dict[s
 
 def read(directory: Path) -> Outcome:
     """The last frame of the run in a directory, and its model; errors as `write`."""
+    if not directory.is_dir():
+        raise InputError(f"{directory}: is no folder; give the one that 'mpitled run' wrote")
     with store.open_result(directory) as result:
         if result.n_frames == 0:
             raise InputError(f"{result.path}: holds no frame yet; run the deck again")

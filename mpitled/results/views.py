@@ -132,7 +132,8 @@ def show(path: Path) -> None:
 
     InputError if there is no result, no PyVista or no screen.
     """
-    directory = path if path.is_dir() else path.parent
+    with store.open_result(path) as result:
+        directory = result.path.parent
     outcome = report.read(directory)
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise InputError(
@@ -140,7 +141,7 @@ def show(path: Path) -> None:
             "makes a page of pictures"
         )
     plotter = pyvista().Plotter(title=f"mpitled: {outcome.title}")
-    with store.open_result(path) as result:
+    with store.open_result(directory) as result:
         solid = solid_of(outcome.model, outcome.moved)
         times, n = result.times, result.n_frames
         largest = float(_norm(solid).vmax)
