@@ -70,6 +70,13 @@ def _print(figures: Any, table: Callable[[Any], str], options: argparse.Namespac
     print(json.dumps(figures, indent=2) if options.json else table(figures))
 
 
+def _mind_the_compiler() -> None:
+    """A word before a silence: whoever calls the kernels for the first time waits for their compilation."""
+    cache = Path(__file__).parent / "solver" / "__pycache__"
+    if "NUMBA_CACHE_DIR" not in os.environ and not any(cache.glob("kernels.*.nbi")):
+        print("note: the kernels are compiled now, once; that takes some 15 s", file=sys.stderr, flush=True)
+
+
 def _output(options: argparse.Namespace) -> Path:
     return options.out or Path("out") / options.deck.stem
 
@@ -82,6 +89,8 @@ def _run(options: argparse.Namespace) -> None:
     world = World()
     with everywhere():  # each rank reads the same file
         deck = load_deck(options.deck, options.set)
+    if world.leads and not options.quiet:
+        _mind_the_compiler()
     if options.dry:
         from mpitled.speed.dry import dry_run
 
@@ -98,7 +107,7 @@ def _run(options: argparse.Namespace) -> None:
 
         _print(made, report.table, options)
         if not options.json:
-            print(f"written to {_output(options)}")
+            print(f"written to {_output(options)}; mpitled report {_output(options)} --html makes a page of it")
 
 
 def _sweep(options: argparse.Namespace) -> int:
@@ -167,6 +176,8 @@ def _build(options: argparse.Namespace) -> None:
 def _check(options: argparse.Namespace) -> None:
     from mpitled.speed import overview
 
+    if options.file.suffix == ".toml":
+        _mind_the_compiler()
     if options.json:
         print(json.dumps(overview.figures(options.file, options.set), indent=2))
     else:
