@@ -113,10 +113,14 @@ def bars(caption: str, unit: str, values: Sequence[tuple[str, float]]) -> str:
     largest = max((value for _, value in values), default=0.0) or 1.0
     rows = [f"<caption>{escape(caption)}</caption>"]
     for name, value in values:
-        bar = f'<td class="bar"><div style="width:{100 * value / largest:.1f}%"></div></td>'
-        rows.append(
-            _row([f'<th scope="row">{escape(name)}</th><td class="number">{value:.3g} {escape(unit)}</td>{bar}'])
+        number = f"{value if value >= 1e-3 else 0:.3g} {escape(unit)}"
+        bar = f'<div style="width:{100 * value / largest:.1f}%"></div>'
+        cells = (
+            f'<th scope="row">{escape(name)}</th>',
+            f'<td class="number">{number}</td>',
+            f'<td class="bar">{bar}</td>',
         )
+        rows.append(_row(cells))
     return f'<div class="wide"><table>{"".join(rows)}</table></div>'
 
 

@@ -6,6 +6,8 @@ in a process of their own.
 
 from __future__ import annotations
 
+import ctypes
+import ctypes.util
 import os
 import subprocess
 import sys
@@ -135,10 +137,10 @@ def show(path: Path) -> None:
     with store.open_result(path) as result:
         directory = result.path.parent
     outcome = report.read(directory)
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    if not _has_screen():
         raise InputError(
-            f"{path}: there is no screen here (DISPLAY is not set) to show it on; mpitled report {directory} --html "
-            "makes a page of pictures"
+            f"{path}: there is no screen here to show it on (DISPLAY is not set, or nobody answers); mpitled report "
+            f"{directory} --html makes a page of pictures"
         )
     plotter = pyvista().Plotter(title=f"mpitled: {outcome.title}")
     with store.open_result(directory) as result:
@@ -159,6 +161,18 @@ def show(path: Path) -> None:
         plotter.add_scalar_bar(_SCALARS)
         plotter.add_axes()
         plotter.show()
+
+
+def _has_screen() -> bool:
+    """Whether a window can open: VTK ends in silence where an X server is wanted and none answers."""
+    if sys.platform != "linux":
+        return True
+    library = ctypes.util.find_library("X11")
+    if not os.environ.get("DISPLAY") or library is None:
+        return False
+    connect = ctypes.CDLL(library).XOpenDisplay
+    connect.restype = ctypes.c_void_p
+    return connect(None) is not None
 
 
 _Paint = Callable[[Any, View, float], None]  # of matplotlib's axes, with a share of the displacement
