@@ -16,7 +16,8 @@ PARTS = {
     part.partition("\n")[0]: "".join(re.findall(r"^```bash\n(.*?)^```$", part, re.MULTILINE | re.DOTALL))
     for part in GUIDE.split("\n## ")[1:]
 }
-#: SLURM's and PBS's commands: a job on two ranks, or a task after the other of an array.
+#: SLURM's commands run a job on one rank, or a task after the other of an array; PBS's takes what it can be given.
+#: tests/test_cluster.py runs both scripts on two ranks.
 SBATCH = """#!/bin/bash
 set -euo pipefail
 while [ "${1#--}" != "$1" ]; do shift 2; done
@@ -32,7 +33,8 @@ QSUB = """#!/bin/bash
 set -euo pipefail
 IFS=, read -ra given <<< "$2"
 export "${given[@]}"
-exec bash "$3"
+bash -n "$3"
+exec mpitled run "$DECK" --dry --set "$SET"
 """
 
 

@@ -267,7 +267,7 @@ def test_unfinished_results_without_figures(tmp_path):
 
     store.write_model(tmp_path / "model.h5", replace(model, points=model.points + 1), "key")
     assert "model.h5" in complaint(mpitled("report", tmp_path, status=2))
-    assert "no such file" in complaint(mpitled("report", tmp_path / "nowhere", status=2))
+    assert "is no folder" in complaint(mpitled("report", tmp_path / "nowhere", status=2))
 
 
 def test_report_goes_on_without_matplotlib(grown, monkeypatch):
