@@ -50,6 +50,11 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
     sweep.add_argument("--jobs", type=_count, default=1, metavar="J", help="cases at work at once, without mpirun (1)")
     sweep.add_argument("--retry", action="store_true", help="compute broken cases again")
     sweep.add_argument("--only", type=_count, metavar="N", help="case N alone and no table, as a task of an array job")
+    sweep.add_argument(
+        "--one-growth",
+        action="store_true",
+        help="one run for all volumes of a tumour, which the largest passes through",
+    )
     sweep.add_argument("--scheduler", choices=["slurm", "pbs"], help="write an array job, compute nothing")
     _beside(sweep)
 
@@ -72,7 +77,11 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
 
     report = command("report", "table, report.json and pictures of a run; the table of a sweep", json=True)
     report.add_argument("directory", type=Path, help="the folder that a run or a sweep wrote")
+    report.add_argument("--html", action="store_true", help="also all of it on one page, report.html")
     _beside(report)
+
+    view = command("view", "a result in a window, to turn and to slide through")
+    view.add_argument("result", type=Path, help="the folder that a run wrote, or its result.vtkhdf")
 
     compare = command("compare", "errors of a result against a reference, in mm", json=True)
     compare.add_argument("result", type=Path, help="the folder that a run wrote")

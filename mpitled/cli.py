@@ -70,6 +70,13 @@ def _print(figures: Any, table: Callable[[Any], str], options: argparse.Namespac
     print(json.dumps(figures, indent=2) if options.json else table(figures))
 
 
+def _mind_the_compiler() -> None:
+    """A word before a silence: whoever calls the kernels for the first time waits for their compilation."""
+    cache = Path(__file__).parent / "solver" / "__pycache__"
+    if "NUMBA_CACHE_DIR" not in os.environ and not any(cache.glob("kernels.*.nbi")):
+        print("note: the kernels are compiled now, once; that takes some 15 s", file=sys.stderr, flush=True)
+
+
 def _output(options: argparse.Namespace) -> Path:
     return options.out or Path("out") / options.deck.stem
 
@@ -82,6 +89,8 @@ def _run(options: argparse.Namespace) -> None:
     world = World()
     with everywhere():  # each rank reads the same file
         deck = load_deck(options.deck, options.set)
+    if world.leads and not options.quiet:
+        _mind_the_compiler()
     if options.dry:
         from mpitled.speed.dry import dry_run
 
@@ -98,18 +107,18 @@ def _run(options: argparse.Namespace) -> None:
 
         _print(made, report.table, options)
         if not options.json:
-            print(f"written to {_output(options)}")
+            print(f"written to {_output(options)}; mpitled report {_output(options)} --html makes a page of it")
 
 
 def _sweep(options: argparse.Namespace) -> int:
-    from mpitled.batch import cases, sweep, vary
+    from mpitled.batch import cases, growth, sweep, vary
     from mpitled.solver.halo import World
     from mpitled.solver.run import everywhere
 
     world = World()
     with everywhere():  # each rank reads the same files
         if options.deck.is_dir():
-            if options.vary or options.cases or options.set or options.out or options.ranks:
+            if options.vary or options.cases or options.set or options.out or options.ranks or options.one_growth:
                 raise InputError(f"{options.deck}: goes on as it began; give the deck to vary, set or place it anew")
             plan = cases.read(options.deck)
         else:
@@ -117,12 +126,16 @@ def _sweep(options: argparse.Namespace) -> int:
                 raise InputError("sweep: nothing is varied; give --vary KEY=A,B,... or --cases CSV")
             values = vary.table(options.cases) if options.cases else vary.grid(options.vary)
             out = options.out or Path("out") / f"sweep_{options.deck.stem}"
-            plan = cases.plan(options.deck, values, options.set, options.ranks or 1, out)
+            plan = cases.plan(options.deck, values, options.set, options.ranks or 1, out, options.one_growth)
+        if plan.one_growth and (options.scheduler or options.only):
+            raise InputError("--one-growth: is one run, and no array of jobs; leave out --scheduler and --only")
     if options.scheduler:
         if world.leads:
             print(sweep.array_job(plan, options.scheduler))
         return 0
     sweep.compute(plan, world, jobs=options.jobs, retry=options.retry, only=options.only)
+    if plan.one_growth and world.leads:
+        growth.tell(plan)
     return _tabulate(plan, options) if world.leads and not options.only else 0
 
 
@@ -163,6 +176,8 @@ def _build(options: argparse.Namespace) -> None:
 def _check(options: argparse.Namespace) -> None:
     from mpitled.speed import overview
 
+    if options.file.suffix == ".toml":
+        _mind_the_compiler()
     if options.json:
         print(json.dumps(overview.figures(options.file, options.set), indent=2))
     else:
@@ -198,8 +213,20 @@ def _report(options: argparse.Namespace) -> int:
 
     if cases.is_sweep(options.directory):
         return _tabulate(cases.read(options.directory), options)
-    _print(report.write(options.directory), report.table, options)
+    if options.html:
+        from mpitled.results import page
+
+        _print(page.write(options.directory), report.table, options)
+        print(f"written to {options.directory / page.PAGE}", file=sys.stderr)
+    else:
+        _print(report.write(options.directory), report.table, options)
     return 0
+
+
+def _view(options: argparse.Namespace) -> None:
+    from mpitled.results import views
+
+    views.show(options.result)
 
 
 def _compare(options: argparse.Namespace) -> None:
@@ -292,6 +319,7 @@ _COMMANDS: dict[str, Callable[[argparse.Namespace], int | None]] = {
     "build": _build,
     "partition": _partition,
     "report": _report,
+    "view": _view,
     "compare": _compare,
     "study": _study,
     "stability": _stability,

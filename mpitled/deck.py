@@ -11,7 +11,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from types import UnionType
@@ -31,7 +31,7 @@ _PER_SI = {"mm": 1e3, "mm3": 1e9, "degrees": 180 / math.pi}
 
 
 class _Key(NamedTuple):
-    """What the parser, the messages and the README say of a key; its type is the annotation of its field."""
+    """What the parser, the messages and the guide say of a key; its type is the annotation of its field."""
 
     meaning: str
     unit: str
@@ -723,6 +723,14 @@ def canonical(deck: Deck) -> dict[str, Any]:
     return plain(deck)
 
 
+def recorded(table: Mapping[str, Any], path: Path) -> Deck:
+    """The deck that `canonical` told so, without its geometry and its motion, whose files may be gone by now."""
+    without = (*GEOMETRIES, "fixed", "displaced")
+    kept = {name: section for name, section in table.items() if name not in without}
+    deck: Deck = _section(Deck, kept, "", _Source(path, frozenset()), {"path": path})
+    return deck
+
+
 _MODEL = (*GEOMETRIES, "tumour", "cloud", "support", "hexahedra", "spheres", "materials", "fixed", "displaced")
 
 
@@ -799,7 +807,7 @@ def unit_of(name: str) -> str:
 
 
 def markdown_table() -> str:
-    """The table of all keys for the README."""
+    """The table of all keys for the guide, jobs/README.md."""
     lines = ["| key | value | unit | default | meaning |", "|---|---|---|---|---|"]
     for home, section, entry in _declared():
         if entry:

@@ -6,7 +6,6 @@ cells: so what is read back is the same model, bit for bit.
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import store
+from mpitled import store, toml
 from mpitled.deck import GEOMETRIES
 from mpitled.errors import InputError
 from mpitled.model import Model
@@ -238,20 +237,20 @@ def _quoted(name: str) -> str:
 def _scene(model: Model, scene: dict[str, Any], files: Sequence[str]) -> Iterator[str]:
     """The deck that the model was built from, with these files in place of its geometry."""
     yield "# Written by mpitled export. Fixed and displaced nodes are in the files of [mesh]; rotations are here too.\n"
-    yield from (f"{key} = {_toml(value)}\n" for key, value in scene.items() if not isinstance(value, dict | list))
+    yield from (f"{key} = {toml.value(value)}\n" for key, value in scene.items() if not isinstance(value, dict | list))
     yield "\n[mesh]\n"
     for key, name in (("fe", FE), ("efg", EFG), ("integration_points", GRID), ("surface_areas", AREAS)):
         if name in files:
-            yield f"{key} = {_toml(name)}\n"
+            yield f"{key} = {toml.value(name)}\n"
     yield 'unit = "m"\nmerge_tolerance = 0.0\n'
     for section, table in scene.items():
         if isinstance(table, dict) and section not in (*GEOMETRIES, "cloud", *_IN_FILES):
             yield f"\n[{section}]\n"
-            yield from (f"{key} = {_toml(value)}\n" for key, value in table.items())
+            yield from (f"{key} = {toml.value(value)}\n" for key, value in table.items())
     for entry in scene.get("displaced", ()):
         if entry["rotation"]:  # the files know where it ends, not that it goes there along an arc
             yield "\n[[displaced]]\n"
-            yield from (f"{key} = {_toml(value)}\n" for key, value in entry.items())
+            yield from (f"{key} = {toml.value(value)}\n" for key, value in entry.items())
     used: set[str] = set()
     for i, material in enumerate(model.materials):
         name = material.name
@@ -260,13 +259,6 @@ def _scene(model: Model, scene: dict[str, Any], files: Sequence[str]) -> Iterato
         used.add(name)
         sets = _sets_of(np.flatnonzero(model.material == i), model.cell_sets)
         if sets:
-            yield f"\n[material.{_toml(name)}]\n"
+            yield f"\n[material.{toml.value(name)}]\n"
             yield f"youngs_modulus = {material.youngs_modulus!r}\npoissons_ratio = {material.poissons_ratio!r}\n"
-            yield f"density = {material.density!r}\ncells = {_toml(sets)}\n"
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_toml, value)) + "]"
-    # JSON's strings, numbers and truth values are TOML's too.
-    return json.dumps(value, ensure_ascii=False)
+            yield f"density = {material.density!r}\ncells = {toml.value(sets)}\n"

@@ -21,6 +21,7 @@ from mpitled.batch.summary import collect, records
 from mpitled.deck import Deck, load_deck
 from mpitled.errors import InputError
 from mpitled.model import Model
+from mpitled.results import views
 from mpitled.solver import run as runs
 from mpitled.solver.halo import World
 
@@ -134,20 +135,7 @@ class RunResult:
 
     def to_pyvista(self, frame: int = -1) -> Any:
         """A frame as pyvista.UnstructuredGrid, undeformed, in metres: hexahedra, and vertices for the rest."""
-        try:
-            import pyvista
-        except ImportError:
-            raise InputError("to_pyvista: PyVista is missing; install it: pip install 'mpitled[python]'") from None
-        result, hexahedra = self._result, self._result.hexahedra
-        jacobian, numbers = result.cell_data("J", frame), result.point_data("node_id")
-        at_rows = np.full(len(numbers), np.nan)  # of integration points, which are the last cells, in the same order
-        at_rows[numbers < 0] = jacobian[len(jacobian) - np.count_nonzero(numbers < 0) :]
-        rest = np.setdiff1d(np.arange(len(numbers)), hexahedra)
-        cells = {pyvista.CellType.HEXAHEDRON: hexahedra, pyvista.CellType.VERTEX: rest[:, None]}
-        grid = pyvista.UnstructuredGrid({kind: nodes for kind, nodes in cells.items() if len(nodes)}, result.points)
-        grid.point_data["displacement"] = result.point_data("field_displacement", frame)
-        grid.cell_data["J"] = np.concatenate([jacobian[: len(hexahedra)], at_rows[rest]])
-        return grid
+        return views.grid(self._result, frame)
 
     def to_xarray(self) -> Any:
         """All frames as xarray.Dataset. InputError if they are more than a gigabyte."""

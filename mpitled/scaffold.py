@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import tempfile
@@ -10,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from mpitled import atomic, deck
+from mpitled import atomic, deck, toml
 from mpitled.errors import InputError
 
 #: A label image that a clone of the repository has; others give their own.
@@ -116,15 +115,9 @@ def _key(written: str, key: deck.Declared, value: Any) -> Iterator[str]:
     """A key with what it means; as a comment if nothing is given."""
     yield f"# {key.meaning}; {key.expected}"
     if value is not None:
-        yield f"{written} = {_toml(value)}"
+        yield f"{written} = {toml.value(value)}"
     else:  # an empty list stands for what is not given
-        yield f"# {written} = {'' if key.default in (None, ()) else _toml(key.default)}".rstrip()
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(_toml, value))}]"
-    return json.dumps(value, ensure_ascii=False)
+        yield f"# {written} = {'' if key.default in (None, ()) else toml.value(key.default)}".rstrip()
 
 
 def _meshes(folder: Path) -> list[Path]:

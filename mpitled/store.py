@@ -840,7 +840,10 @@ def open_result(path: Path) -> Result:
     """
     path = Path(path)
     if path.is_dir():
-        path = next((path / name for name in (_UNFINISHED, _FINISHED) if (path / name).exists()), path / _FINISHED)
+        there = [path / name for name in (_UNFINISHED, _FINISHED) if (path / name).exists()]
+        if not there:
+            raise InputError(f"{path}: holds no result; give the folder that 'mpitled run' wrote")
+        path = there[0]
     file = _open(path)
     layout = file["mpitled"].attrs.get("layout") if "mpitled" in file and "VTKHDF" in file else None
     if layout == RESULT_LAYOUT:

@@ -47,6 +47,18 @@ def script(name: str, *arguments: object, n: int, timeout: float = 120) -> str:
     return done.stdout
 
 
+@pytest.fixture(scope="session")
+def segmentation(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """What the guide's way from a segmentation to a table wrote (out/trial, out/table) and said."""
+    for library in ("nibabel", "matplotlib"):
+        pytest.importorskip(library)
+    from guide import PARTS, follow
+
+    folder = tmp_path_factory.mktemp("guide")
+    said = follow(folder, PARTS["From a segmentation to a table"])
+    return folder / "out", said
+
+
 def complaint(done: subprocess.CompletedProcess[str]) -> str:
     """The one line with which mpitled ended (mpirun adds words of its own)."""
     lines: Sequence[str] = [line for line in done.stderr.splitlines() if line.startswith("mpitled:")]

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from mpitled import deck as decks
 from mpitled.deck import canonical, load_deck, markdown_table, model_key
 from mpitled.errors import InputError
+from mpitled.toml import lines
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -416,7 +417,7 @@ def test_a_canonical_deck_reads_as_the_same_deck(
     for given_edge, edge in zip(size, written["block"]["size"], strict=True):
         assert edge == given_edge or float(f"{given_edge:.15g}") != given_edge
     for again in (written, json.loads(json.dumps(written))):
-        reread = load_deck(write(folder, again))
+        reread = load_deck(write(folder, "\n".join(lines(again))))
         assert reread == deck
         assert canonical(reread) == written
         assert model_key(reread) == model_key(deck)

@@ -11,8 +11,9 @@ from conftest import mpitled
 from mpitled.deck import load_deck
 from mpitled.solver.halo import World
 from mpitled.solver.run import prepare
-from mpitled.speed.dry import reasons
+from mpitled.speed.dry import left_out, reasons
 from mpitled.speed.witness import kernel_names
+from mpitled.store import open_result
 
 SCENE = """
 [block]
@@ -56,10 +57,17 @@ def test_a_dry_run_tells_the_terms_that_the_run_takes_and_takes_no_step(tmp_path
     assert ("of domain_forces and domain_survey: support.stabilisation = 0" in told) == (cloud == "core")
     assert ("pack, clear, unpack: one rank" in told) == (ranks == 1)
     assert ("follow: no node is turned" in told) == (cloud != "all")
+    if ranks == 1:  # what the result tells of itself
+        with open_result(out) as result:
+            spared = left_out(out, result.metadata)
+        lines = told.splitlines()
+        first = lines.index("left out:") + 1
+        assert [f"  {what}" for what in spared] == lines[first : first + len(spared)]
+        assert lines[first + len(spared)].startswith("steps:")
 
 
 def test_every_kernel_is_either_taken_or_left_out_for_a_reason(tmp_path):
     deck = tmp_path / "scene.toml"
     deck.write_text(SCENE.format(cloud="none"))
     scene = load_deck(deck)
-    assert set(reasons(scene, prepare(scene, tmp_path, World()).sub, World())) == set(kernel_names())
+    assert set(reasons(scene, prepare(scene, tmp_path, World()).sub, 1)) == set(kernel_names())

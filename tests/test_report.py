@@ -16,9 +16,10 @@ from conftest import complaint, mpitled
 from mpitled import info, store
 from mpitled.deck import Cloud, load_deck
 from mpitled.mesh import grid_points, structured_hexahedra
-from mpitled.meshing.cloud import boundary_faces, fill_void, interface_faces
+from mpitled.meshing.cloud import FACES, boundary_faces, fill_void, interface_faces
 from mpitled.preprocess import build
 from mpitled.results import report
+from mpitled.results.solid import cut_tetrahedra, solid_of, triangles_of
 from mpitled.solver import hexahedra
 
 GROWTH = """
@@ -266,7 +267,7 @@ def test_unfinished_results_without_figures(tmp_path):
 
     store.write_model(tmp_path / "model.h5", replace(model, points=model.points + 1), "key")
     assert "model.h5" in complaint(mpitled("report", tmp_path, status=2))
-    assert "no such file" in complaint(mpitled("report", tmp_path / "nowhere", status=2))
+    assert "is no folder" in complaint(mpitled("report", tmp_path / "nowhere", status=2))
 
 
 def test_report_goes_on_without_matplotlib(grown, monkeypatch):
@@ -278,13 +279,12 @@ def test_report_goes_on_without_matplotlib(grown, monkeypatch):
 
 def test_cuts_are_exact():
     """A slanted plane through a cube, x + y + z = 1.2: the area is closed, and linear values are met."""
-    plot = pytest.importorskip("mpitled.results.plot")
     points, cells = grid_points((3, 3, 3), (1.0, 1.0, 1.0)), structured_hexahedra((3, 3, 3))
     vertices = np.concatenate([points, points[cells].mean(axis=1)])
-    triangles = plot._triangles(cells[:, plot.FACES].reshape(-1, 4))
+    triangles = triangles_of(cells[:, FACES].reshape(-1, 4))
     middle = np.tile(np.repeat(len(points) + np.arange(len(cells)), 6), 2)
     height = vertices.sum(axis=1) - 1.2
-    pieces = plot.cut_tetrahedra(vertices, height, np.column_stack([triangles, middle]))
+    pieces = cut_tetrahedra(vertices, height, np.column_stack([triangles, middle]))
     np.testing.assert_allclose(pieces.sum(axis=2), 1.2, rtol=1e-14)
     area = np.linalg.norm(np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0]), axis=1).sum() / 2
     assert area == pytest.approx(np.sqrt(3) / 2 * (1.2**2 - 3 * 0.2**2), rel=1e-13)
@@ -292,11 +292,10 @@ def test_cuts_are_exact():
 
 def test_the_cloud_is_drawn_without_holes(tmp_path):
     """Random places of the cloud in a plane through the middle: each is in a piece of the cut."""
-    plot = pytest.importorskip("mpitled.results.plot")
     model = model_of(tmp_path, GROWTH, elements="12, 10, 10", cloud="core")
-    solid = plot._solid(model, np.zeros_like(model.points))
+    solid = solid_of(model, np.zeros_like(model.points))
     height = solid.points[:, 0] - 25.0  # between the hexahedra's layers
-    pieces = plot.cut_tetrahedra(solid.points[:, [1, 2]], height, solid.cloud)
+    pieces = cut_tetrahedra(solid.points[:, [1, 2]], height, solid.cloud)
     places = np.random.default_rng(2).uniform(0, 40, (4000, 2))
     corners = solid.points[solid.hexahedra]
     low, high = corners.min(axis=1), corners.max(axis=1)

@@ -21,7 +21,7 @@ OWNERS = {
     "h5py": {"mpitled.store"},
     "mpi4py": {"mpitled.solver.halo"},
     "pymetis": {"partition.metis"},
-    "pyvista": {"mpitled.interface"},
+    "pyvista": {"mpitled.results.views"},
     "xarray": {"mpitled.interface"},
     "argcomplete": {"mpitled.cli"},
 }
@@ -147,8 +147,8 @@ def test_nothing_strays_at_the_top_of_the_repository():
     assert {name for name in top if not name.startswith(".")} <= TOP
 
 
-def test_the_readmes_table_is_that_of_the_deck():
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+def test_the_guides_table_is_that_of_the_deck():
+    readme = (ROOT / "jobs" / "README.md").read_text(encoding="utf-8")
     _, table = readme.split("<!-- deck table -->\n")
     table, _ = table.split("<!-- end of deck table -->")
     remedy = "python -c 'from mpitled import deck; print(deck.markdown_table())' prints the one to put in"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import os
 import shutil
 import signal
@@ -15,7 +16,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from conftest import ENVIRONMENT, ROOT, mpitled
+from conftest import ENVIRONMENT, ROOT, complaint, mpitled
 
 from mpitled import open_sweep
 from mpitled.batch import cases, screen, summary, vary
@@ -99,8 +100,8 @@ def test_tables_for_programs_and_for_people(tmp_path, groups):
     assert "12.50" in lines[4]
     page = (out / "table.html").read_text()
     assert page.count("<tr>") == 5
+    assert page.count('<img src="data:image/png;base64,') == 2
     for name in ("quantities.png", "cost.png"):
-        assert name in page
         assert (out / name).stat().st_size > 10_000
     assert [record["case"] for record in open_sweep(out)] == [1, 2, 3]
 
@@ -199,3 +200,74 @@ def test_two_sweeps_do_not_work_in_one_folder(tmp_path):
         fcntl.flock(held, fcntl.LOCK_EX)
         done = mpitled("sweep", CUBE, "--vary", "solver.load_steps=5", "--out", tmp_path / "out", status=2)
     assert "another sweep is at work" in done.stderr
+
+
+GROWTH = """
+[block]
+size = [48.0, 40.0, 40.0]
+elements = [12, 10, 10]
+cloud = "core"
+[tumour]
+centre = [24.0, 20.0, 20.0]
+volume = 523.6
+surface_nodes = 400
+[cloud]
+radius = 11.0
+growth = 0.35
+[material.brain]
+youngs_modulus = 3000.0
+poissons_ratio = 0.49
+[[fixed]]
+nodes = "surface"
+[solver]
+load_time = 0.5
+[output]
+pictures = false
+"""
+
+
+def test_one_growth_passes_through_what_runs_of_their_own_find(tmp_path):
+    deck, out, apart = tmp_path / "scene.toml", tmp_path / "out", tmp_path / "apart"
+    deck.write_text(GROWTH)
+    words = ["sweep", deck, "--vary", "tumour.volume=150,523.6,300", "--one-growth"]
+    mpitled(*words, "--out", out)
+    rows = open_sweep(out)
+    assert len(list(out.glob("*/result.vtkhdf"))) == 1
+    for row in rows[::2]:
+        mpitled("run", deck, "-q", "--set", f"tumour.volume={row['tumour.volume']}", "--out", apart)
+        alone = json.loads((apart / "report.json").read_text())
+        folder = next(out.glob(f"tumour.volume-{row['tumour.volume']:g}-*"))
+        passed = json.loads((folder / "report.json").read_text())
+        assert passed["tumour_volume_mm3"] == pytest.approx(row["tumour.volume"], rel=1e-9)
+        for key in ("max_displacement_mm", "max_displacement_outside_first_ring_mm"):
+            assert abs(passed[key] - alone[key]) < passed["static_distance_mm"] + alone["static_distance_mm"]
+        assert 0 < passed["interpolation_mm"] < passed["static_distance_mm"]
+        pushed = [r["volume_balance"]["pushed_through_interface_mm3"] for r in (passed, alone)]
+        assert pushed[0] == pytest.approx(pushed[1], rel=0.02)
+    assert rows[0]["min_jacobian"] > rows[2]["min_jacobian"] > rows[1]["min_jacobian"]
+
+    # The same again when a case is open, and what a stopped run passed through is told, the rest broken for its reason.
+    table = (out / "table.csv").read_bytes()
+    next(out.glob("tumour.volume-150-*/done.json")).unlink()
+    mpitled("sweep", out)
+    assert (out / "table.csv").read_bytes() == table
+    broken = tmp_path / "broken"
+    too_much = ["--vary", "tumour.volume=150,20000,60000", "--one-growth", "--set", "solver.load_time=0.1"]
+    mpitled("sweep", deck, *too_much, "--out", broken, status=3)
+    told = {row["tumour.volume"]: row["failure"] for row in open_sweep(broken)}
+    assert told[150.0] == ""
+    assert "unstable" in told[20000.0]
+    assert told[20000.0] == told[60000.0]
+
+
+def test_one_growth_is_for_slow_loading_to_volumes(tmp_path):
+    deck = tmp_path / "scene.toml"
+    deck.write_text(GROWTH)
+    for words, reason in (
+        (["--vary", "cloud.growth=0.3,0.4"], "tumour.volume alone"),
+        (["--vary", "tumour.volume=100,200", "--set", "solver.method=dynamic"], "not near rest"),
+        (["--vary", "tumour.volume=100,200", "--scheduler", "slurm"], "no array of jobs"),
+    ):
+        done = mpitled("sweep", deck, *words, "--one-growth", "--out", tmp_path / "out", status=2)
+        assert reason in complaint(done)
+    assert not (tmp_path / "out").exists()

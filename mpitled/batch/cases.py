@@ -18,6 +18,8 @@ from mpitled.loading import sphere_radius
 from mpitled.solver.run import included
 
 MANIFEST = "sweep.json"
+#: Frames of a run that passes through the volumes of a sweep; between them results are interpolated.
+FRAMES = 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,6 +72,12 @@ class Sweep:
     ranks: int  # of each case
     folder: Path
     cases: tuple[Case, ...]
+    one_growth: bool = False  # whether the largest tumour alone is run, and the others are on its way
+
+    @property
+    def runs(self) -> tuple[Case, ...]:
+        """The cases that are computed by themselves."""
+        return (max(self.cases, key=_volume),) if self.one_growth else self.cases
 
     @property
     def keys(self) -> list[str]:
@@ -81,11 +89,19 @@ class Sweep:
         self.folder.mkdir(parents=True, exist_ok=True)
         cases = [{"number": c.number, "folder": c.folder.name, "values": c.values} for c in self.cases]
         manifest = {"deck": str(self.deck.resolve()), "overrides": self.base, "ranks": self.ranks, "cases": cases}
+        manifest |= {"one_growth": self.one_growth}
         atomic.write_text(self.folder / MANIFEST, json.dumps(manifest, indent=2) + "\n")
 
 
-def plan(deck: Path, values: Sequence[vary.Values], base: Sequence[str], ranks: int, folder: Path) -> Sweep:
-    """The sweep of a deck over values of keys.
+def plan(
+    deck: Path,
+    values: Sequence[vary.Values],
+    base: Sequence[str],
+    ranks: int,
+    folder: Path,
+    one_growth: bool = False,
+) -> Sweep:
+    """The sweep of a deck over values of keys; one_growth: as one run, see `growth`.
 
     InputError for what a deck does not take, before anything runs, and for a case that is there twice.
     """
@@ -93,6 +109,11 @@ def plan(deck: Path, values: Sequence[vary.Values], base: Sequence[str], ranks: 
     for given in values:
         overrides = vary.overrides(base, given)
         scene = decks.load_deck(deck, overrides)
+        if one_growth:
+            _check_growth(scene, given)
+            if scene.output.frames < FRAMES:
+                overrides = (*overrides, f"output.frames={FRAMES}")
+                scene = decks.load_deck(deck, overrides)
         files = included(scene)
         scenes.append((given, overrides, scene, decks.scene_key(scene, files), decks.model_key(scene, files)))
     numbers: dict[str, int] = {}
@@ -100,17 +121,32 @@ def plan(deck: Path, values: Sequence[vary.Values], base: Sequence[str], ranks: 
         if (first := numbers.setdefault(key, number)) != number:
             raise InputError(f"{deck}: cases {first} and {number} are the same; leave one out")
     models = [model for *_, model in scenes]
-    cases = []
+    cases, mode = [], f"{ranks} one growth" if one_growth else f"{ranks}"
     for number, (given, overrides, scene, key, model) in enumerate(scenes, 1):
         words = " ".join(f"{name}-{value}" for name, value in given.items())
         name = hashlib.sha256(model.encode()).hexdigest()[:16]
         cases.append(
             Case(
-                number, given, overrides, scene, folder / vary.folder(words, f"{ranks} {key}"),
+                number, given, overrides, scene, folder / vary.folder(words, f"{mode} {key}"),
                 folder / "models" / name, models.count(model) > 1,
             )
         )  # fmt: skip
-    return Sweep(deck, tuple(base), ranks, folder, tuple(cases))
+    return Sweep(deck, tuple(base), ranks, folder, tuple(cases), one_growth)
+
+
+def _check_growth(deck: Deck, given: vary.Values) -> None:
+    """InputError unless a larger tumour passes through what the case asks for."""
+    if list(given) != ["tumour.volume"] or deck.tumour is None:
+        raise InputError("--one-growth: is for tumour.volume alone; vary nothing else, or leave it out")
+    if deck.solver.method != "quasi-static":
+        raise InputError(
+            f'--one-growth: solver.method = "{deck.solver.method}" is not near rest while it grows; take '
+            '"quasi-static", or leave it out'
+        )
+
+
+def _volume(case: Case) -> float:
+    return case.deck.tumour.volume if case.deck.tumour else 0.0
 
 
 def is_sweep(folder: Path) -> bool:
@@ -125,8 +161,9 @@ def read(folder: Path) -> Sweep:
         manifest = json.loads(path.read_text(encoding="utf-8"))
         values = [case["values"] for case in manifest["cases"]]
         deck, base, ranks = Path(manifest["deck"]), manifest["overrides"], manifest["ranks"]
+        one_growth = manifest["one_growth"]
     except FileNotFoundError:
         raise InputError(f"{folder}: holds no sweep; give a deck, or the folder that 'mpitled sweep' wrote") from None
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(f"{path}: cannot be read; give the deck again with --vary or --cases") from None
-    return plan(deck, values, base, ranks, folder)
+    return plan(deck, values, base, ranks, folder, one_growth)

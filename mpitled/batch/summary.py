@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import html
 import json
 import math
 import sys
@@ -16,6 +15,7 @@ from mpitled.batch import launch
 from mpitled.batch.cases import Sweep
 from mpitled.deck import unit_of
 from mpitled.errors import InputError
+from mpitled.results import markup
 
 Row = dict[str, float | str]
 
@@ -118,11 +118,11 @@ def text(table: Table) -> str:
     cells = [[*heading.split(", ")] for heading in headings]
     depth = max(map(len, cells))
     heads = [[(words + [""] * depth)[i] for words in cells] for i in range(depth)]
-    figures = [line for line in lines if not _is_remark(line)]
+    figures = [line for line in lines if not _is_remark(line, table)]
     widths = [max(len(line[i]) for line in (*heads, *figures)) for i in range(len(headings))]
     made = []
     for line in (*heads, *lines):
-        shown = line if not _is_remark(line) else [cell for cell in line if cell]
+        shown = line if not _is_remark(line, table) else [cell for cell in line if cell]
         made.append("  ".join(f"{cell:>{width}}" for cell, width in zip(shown, widths, strict=False)))
     return "\n".join(made)
 
@@ -194,6 +194,7 @@ def _rendered(table: Table) -> tuple[list[str], list[list[str]]]:
     columns = [c for c in _RENDERED if any((row | time)[c.name] != "" for row, time in _pairs(table))]
     headings = [f"{key}, {unit}" if (unit := unit_of(key)) else key for key in table.keys]
     headings += [*([""] if table.beside else []), *(column.heading for column in columns)]
+    headings += [] if columns else ["figures"]  # none: there is room for why
     lines = []
     for row, time in _pairs(table):
         values = [f"{row[key]:.10g}" if isinstance(row[key], float) else str(row[key]) for key in table.keys]
@@ -207,8 +208,9 @@ def _rendered(table: Table) -> tuple[list[str], list[list[str]]]:
     return headings, lines
 
 
-def _is_remark(line: list[str]) -> bool:
-    return len(line) > 3 and not any(line[-3:])
+def _is_remark(line: list[str], table: Table) -> bool:
+    """Whether it says why there are no figures."""
+    return any(row["failure"] and row["failure"] in line for row in table.rows)
 
 
 def _pairs(table: Table) -> Iterator[tuple[Row, Row]]:
@@ -242,7 +244,7 @@ def _draw(table: Table, folder: Path) -> list[Path]:
         label = f"{key}, {unit}" if (unit := unit_of(key)) else key
         charts.draw_quantities(families, key, label, quantities, folder / "quantities.png")
         made.append(folder / "quantities.png")
-    if timed := [row for row in rows if row["error_estimate_mm"] != ""]:
+    if timed := [row for row in rows if row["error_estimate_mm"] != "" and row["loop_s"] != ""]:
         points = [(float(row["loop_s"]), float(row["error_estimate_mm"]), _label(row, table.keys)) for row in timed]
         charts.draw_cost(points, folder / "cost.png")
         made.append(folder / "cost.png")
@@ -253,26 +255,17 @@ def _label(row: Row, keys: Sequence[str]) -> str:
     return " ".join(f"{row[key]:g}" if isinstance(row[key], float) else str(row[key]) for key in keys)
 
 
-_PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
-body {{ font-family: sans-serif; margin: 2em; color: #222 }}
-table {{ border-collapse: collapse }}
-th, td {{ padding: 0.3em 0.7em; text-align: right; border-bottom: 1px solid #ccc }}
-img {{ max-width: 100%; display: block; margin-top: 1.5em }}
-</style></head><body>
-<h1>{title}</h1>
-<table>
-{rows}
-</table>
-{images}
-</body></html>
-"""
-
-
 def _html(sweep: Sweep, table: Table, charts: Sequence[Path]) -> str:
+    """A page that is one file: the table, and the charts."""
     headings, lines = _rendered(table)
-    rows = ["<tr>" + "".join(f"<th>{html.escape(cell)}</th>" for cell in headings) + "</tr>"]
-    rows += ["<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in line) + "</tr>" for line in lines]
-    images = [f'<img src="{path.name}" alt="{path.stem}">' for path in charts]
-    title = html.escape(sweep.cases[0].deck.title or sweep.deck.stem)
-    return _PAGE.format(title=title, rows="\n".join(rows), images="\n".join(images))
+    title, n = sweep.cases[0].deck.title or sweep.deck.stem, len(sweep.cases)
+    alt = {
+        "quantities": f"Charts of the results against {table.keys[0]}",
+        "cost": "Chart of the error estimate in mm against the time of the loop in s",
+    }
+    parts = {
+        "Results": [markup.table(headings, lines)],
+        "Charts": [markup.picture(path.read_bytes(), alt[path.stem]) for path in charts],
+    }
+    head = [markup.text(f"{n} cases of {sweep.deck.name}, varied: {', '.join(table.keys)}", "faint")]
+    return markup.page(title, head, list(parts.items()))

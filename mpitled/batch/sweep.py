@@ -38,7 +38,7 @@ def compute(sweep: Sweep, world: World, *, jobs: int = 1, retry: bool = False, o
             raise InputError(f"--ranks {sweep.ranks}: {world.size} ranks are no whole groups of it; start a multiple")
         if only is not None and not 0 < only <= len(sweep.cases):
             raise InputError(f"--only {only}: there are {len(sweep.cases)} cases; count them from 1")
-    cases = [case for case in sweep.cases if only is None or case.number == only]
+    cases = [case for case in sweep.runs if only is None or case.number == only]
     with _alone(sweep, world, only):
         token = world.broadcast(secrets.token_hex(4))
         todo = runs.on_leader(world, lambda: [case.number for case in _to_do(cases, retry)])
@@ -116,8 +116,8 @@ def _as_processes(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], jo
                 shares = {case.words: share_done(launch.said(process.folder)) for case, process in working.items()}
                 screen.show(shares, len(waiting))
     except KeyboardInterrupt:
-        done = sum(case.failure is not None for case in sweep.cases)
-        raise InterruptedRun(f"interrupted at {done} of {len(sweep.cases)} cases; the same command goes on") from None
+        done = sum(case.failure is not None for case in sweep.runs)
+        raise InterruptedRun(f"interrupted at {done} of {len(sweep.runs)} cases; the same command goes on") from None
     finally:
         for process in working.values():
             process.stop()

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 _COLOURS = ("#000000", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 _MARKERS = "os^Dv<>P"
 _INK = "#222222"
+_To = Path | BinaryIO
 
 
 def _logarithmic(axes: Axes, x: str, y: str) -> None:
@@ -197,6 +198,74 @@ def draw_rivals(panels: dict[str, list[dict[str, Any]]], path: Path, time: str, 
         axes.set_title(title)
     every[0].legend(fontsize=8, title="numbers: unknowns")
     figure.savefig(path, dpi=150)
+
+
+#: Energies of a run's history by the names of its series; the hourglass's and the stabilisation's are one line.
+_ENERGIES = {
+    "external": "external work",
+    "strain": "strain energy",
+    "artificial": "hourglass control and stabilisation",
+    "kinetic": "kinetic energy",
+    "taken": "taken by damping and changes of mass",
+}
+
+
+def draw_history(times: NDArray[np.float64], series: Mapping[str, NDArray[np.float64]], label: str, path: _To) -> None:
+    """Energies, kinetic over internal energy, and the smallest J of a run at its frames; label: of the time's axis."""
+    figure = Figure(figsize=(13, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    energies, ratio, smallest = figure.subplots(1, 3)
+    values = dict(series) | {"artificial": series["hourglass"] + series["stabilisation"]}
+    values["taken"] = series["dissipated"] - series["added"]
+    largest = max(float(np.abs(values[name]).max()) for name in _ENERGIES) or 1.0
+    power = min(0, 3 * math.floor(math.log10(largest) / 3))
+    scale, prefix = 10.0**-power, {0: "", -3: "m", -6: "\u00b5", -9: "n"}.get(power)
+    unit = f"{prefix}J" if prefix is not None else f"1e{power} J"
+    for i, (name, words) in enumerate(_ENERGIES.items(), 1):
+        energies.plot(times, scale * values[name], label=words, color=_COLOURS[i], marker=_MARKERS[i], markersize=4)
+    energies.set(xlabel=label, ylabel=f"energy ({unit})", title="energy")
+    energies.legend(fontsize=8)
+    percent = 100 * series["kinetic_ratio"]
+    ratio.plot(times[percent > 0], percent[percent > 0], color=_COLOURS[4], marker=_MARKERS[4], markersize=4)
+    ratio.set(xlabel=label, ylabel="kinetic over internal energy (%)", title="rest", yscale="log")
+    smallest.plot(times, series["min_jacobian"], color=_COLOURS[3], marker=_MARKERS[3], markersize=4)
+    smallest.set(xlabel=label, ylabel="smallest J (1)", title="smallest J so far", ylim=(0, None))
+    for axes in (energies, ratio, smallest):
+        axes.grid(True, linewidth=0.3)
+    figure.savefig(path, dpi=110)
+
+
+def draw_histogram(size: NDArray[np.float64], volumes: NDArray[np.float64], mark: float, path: _To) -> None:
+    """Share of the volume whose displacement (mm) is so large; a line at `mark` (mm)."""
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    share = 100 * volumes / volumes.sum()
+    axes.hist(size, bins=40, range=(0, float(size.max()) or 1.0), weights=share, color=_COLOURS[1], edgecolor="white")
+    axes.set(xlabel="displacement (mm)", ylabel="share of the volume (%)", yscale="log")
+    if mark < size.max():
+        beyond = share[size > mark].sum()
+        label = f"{mark:g} mm: {beyond:.2g} % of the volume moved more"
+        axes.axvline(mark, color=_COLOURS[2], linestyle="--", label=label)
+        axes.legend()
+    axes.grid(True, linewidth=0.3)
+    figure.savefig(path, dpi=110)
+
+
+def draw_balance(grown: float, found: Mapping[str, float], path: _To) -> None:
+    """The volume that a tumour added (mm3), and below it where it was found, one piece after the other."""
+    figure = Figure(figsize=(8, 2.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.barh(1, grown, color=_COLOURS[2], label="added by the tumour")
+    begin = 0.0
+    for i, (name, volume) in enumerate(found.items()):
+        axes.barh(0, volume, left=begin, color=_COLOURS[(1, 6)[i]], label=name)
+        begin += volume
+    axes.set_yticks([0, 1], ["found", "added"])
+    axes.set_xlabel("volume (mm\u00b3)")
+    figure.legend(loc="outside lower center", ncols=3, frameon=False)
+    figure.savefig(path, dpi=110)
 
 
 #: Outcomes of the stability matrix as colours of fill and text, of different lightness too.

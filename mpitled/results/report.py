@@ -49,6 +49,11 @@ class Outcome:
     figures: dict[str, Any]  # what it ended with; empty if it was killed
 
     @property
+    def title(self) -> str:
+        """Of the scene; there is always one."""
+        return self.metadata.get("title") or "mpitled"
+
+    @property
     def seed(self) -> NDArray[np.int64]:
         """Nodes on the surface of the tumour; none without one."""
         return self.model.node_sets.get("tumour", np.empty(0, np.int64))
@@ -58,6 +63,13 @@ class Outcome:
         """The tumour's centre (3,), m."""
         tumour = self.metadata.get("tumour")
         return np.array(tumour["centre_m"]) if tumour else None
+
+    @property
+    def moved(self) -> NDArray[np.float64]:
+        """(n_nodes, 3), m: the field, and the tumour's surface as prescribed."""
+        moved = self.field.copy()
+        moved[self.seed] = self.displacement[self.seed]
+        return moved
 
 
 def write(directory: Path, seconds: Mapping[str, float] | None = None) -> dict[str, Any]:
@@ -80,6 +92,8 @@ def write(directory: Path, seconds: Mapping[str, float] | None = None) -> dict[s
 
 def read(directory: Path) -> Outcome:
     """The last frame of the run in a directory, and its model; errors as `write`."""
+    if not directory.is_dir():
+        raise InputError(f"{directory}: is no folder; give the one that 'mpitled run' wrote")
     with store.open_result(directory) as result:
         if result.n_frames == 0:
             raise InputError(f"{result.path}: holds no frame yet; run the deck again")
@@ -156,12 +170,18 @@ def _warnings(report: Mapping[str, Any], ramped: bool) -> list[str]:
     return found
 
 
+def incomplete(report: Mapping[str, Any]) -> str:
+    """What there is of a run that did not come to its end, and why, if it could say so."""
+    stopped = f": {report['stopped']}" if "stopped" in report else ""
+    return f"not complete: {report['load_share']:.1%} of the load time{stopped}"
+
+
 def table(report: Mapping[str, Any]) -> str:
     """The report for people to read; what is absent there is absent here."""
     lines = [report["title"]] if report["title"] else []
     if not report["complete"]:
-        lines.append(f"not complete: {report['load_share']:.1%} of the load time")
-    lines += [f"  {name:<40}  {value}" for name, value in _rows(report)]
+        lines.append(incomplete(report))
+    lines += [f"  {name:<40}  {value}" for name, value in rows(report)]
     lines += [f"  warning: {text}" for text in report["warnings"]]
     pictures = report["pictures"]
     lines.append(f"  {'pictures':<40}  {', '.join(pictures) if isinstance(pictures, list) else pictures}")
@@ -271,12 +291,10 @@ def _draw(outcome: Outcome, directory: Path) -> list[str] | str:
     except ImportError:
         return "none, for matplotlib is missing; install it: pip install 'mpitled[pictures]'"
     from mpitled.results import plot
+    from mpitled.results.solid import solid_of
 
-    moved = outcome.field.copy()
-    moved[outcome.seed] = outcome.displacement[outcome.seed]  # the tumour's surface as prescribed
-    title = outcome.metadata.get("title") or "mpitled"
     try:
-        return plot.draw(directory, outcome.model, moved, outcome.centre, title)
+        return plot.draw(directory, solid_of(outcome.model, outcome.moved), outcome.centre, outcome.title)
     except OSError as error:
         raise InputError(f"{directory}: pictures cannot be written ({error.strerror})") from None
 
@@ -326,7 +344,8 @@ _LINES = (
 )
 
 
-def _rows(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def rows(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Name and value of each line of the table."""
     for key, name, form in _LINES:
         value: Any = report
         for part in key.split("."):

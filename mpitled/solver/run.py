@@ -229,8 +229,8 @@ class _Run:
             elif self.deck.solver.method == "quasi-static":
                 with self.phases("static distance"):
                     self.distance = self._distance_to_static()
-        except MpitledError:
-            writer.abandon(self._run_figures(time.perf_counter() - begin))
+        except MpitledError as error:
+            writer.abandon(self._run_figures(time.perf_counter() - begin) | {"stopped": str(error)})
             raise
         finally:
             for which, handler in previous.items():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import textwrap
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
@@ -13,11 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from mpitled import deck as decks
 from mpitled.deck import Deck
 from mpitled.solver import run as runs
 from mpitled.solver.halo import World
 from mpitled.solver.march import March
 from mpitled.solver.subdomain import SHORTEST_RUN, Subdomain
+from mpitled.speed.forecast import first_rank
 from mpitled.speed.witness import Call, distinct_bytes, witness
 
 #: Times that each term is called to tell how long it takes; the fastest counts, for others may use the machine too.
@@ -49,7 +51,8 @@ def dry_run(deck: Deck, directory: Path, world: World) -> str:
         numbers = [f"{value:{width}.0f}" for value, width in zip(row, (11, 9, 9, 8, 20, 20), strict=False)]
         lines.append(f"{rank:4}{''.join(numbers)}{row[-2]:10.3f}{row[-1]:12.3f}")
     lines += _told(calls, surveyed, seconds)
-    left_out = [world.broadcast(_left_out(deck, sub, world, calls, surveyed), rank) for rank in range(world.size)]
+    own = _left_out(deck, sub, world.size, (*calls, *surveyed))
+    left_out = [world.broadcast(own, rank) for rank in range(world.size)]
     lines.append("left out:")
     for what in dict.fromkeys(what for of_rank in left_out for what in of_rank):
         ranks = [str(rank) for rank, of_rank in enumerate(left_out) if what in of_rank]
@@ -88,15 +91,22 @@ def _kernels(calls: Sequence[Call]) -> list[str]:
     return lines
 
 
-def _left_out(deck: Deck, sub: Subdomain, world: World, calls: Sequence[Call], surveyed: Sequence[Call]) -> list[str]:
+def left_out(directory: Path, metadata: Mapping[str, Any]) -> list[str]:
+    """What the run in a directory, whose result records this of it, did without on rank 0, as `dry_run` tells it."""
+    deck, ranks = decks.recorded(metadata["deck"], directory), metadata["ranks"]
+    sub, method = first_rank(deck, directory / runs.MODEL, ranks)
+    return _left_out(deck, sub, ranks, witness([("all", method.warm_up)]))
+
+
+def _left_out(deck: Deck, sub: Subdomain, ranks: int, calls: Sequence[Call]) -> list[str]:
     """The kernels that are not called and the arguments that are not there, each with what spares them."""
-    called = {call.kernel for call in (*calls, *surveyed)}
+    called = {call.kernel for call in calls}
     spared: dict[str, list[str]] = {}
-    for kernel, why in reasons(deck, sub, world).items():
+    for kernel, why in reasons(deck, sub, ranks).items():
         if why and kernel not in called:
             spared.setdefault(why, []).append(kernel)
     absent: dict[str, list[str]] = {}
-    for call in (*calls, *surveyed):
+    for call in calls:
         for name in call.absent:
             absent.setdefault(name, []).append(call.kernel)
     for name, kernels in absent.items():
@@ -106,14 +116,14 @@ def _left_out(deck: Deck, sub: Subdomain, world: World, calls: Sequence[Call], s
     return [f"{', '.join(names)}: {why}" for why, names in spared.items()]
 
 
-def reasons(deck: Deck, sub: Subdomain, world: World) -> dict[str, str]:
+def reasons(deck: Deck, sub: Subdomain, ranks: int) -> dict[str, str]:
     """Why each kernel is not called, if it is not; "" where it may yet be, later in the run."""
     relaxes = deck.solver.method == "dynamic-relaxation"
     hexahedra = "no hexahedra" if len(sub.rows.hexahedra) == 0 else ""
     voxels = hexahedra or f"no {SHORTEST_RUN} equal boxes in a row"
     general = hexahedra or f"all hexahedra are boxes, {SHORTEST_RUN} or more in a row"
     domains = "no support domains"
-    alone = "one rank" if world.size == 1 else "no node is shared"
+    alone = "one rank" if ranks == 1 else "" if sub.shared else "no node is shared"
     method = f'solver.method = "{deck.solver.method}"'
     heavier = method if deck.solver.method != "quasi-static" else "solver.mass_scaling = false"
     return {

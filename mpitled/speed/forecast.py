@@ -14,7 +14,7 @@ from mpitled.solver.halo import World
 from mpitled.solver.march import March
 from mpitled.solver.relaxation import Relaxation
 from mpitled.solver.run import PRECISIONS
-from mpitled.solver.subdomain import localise
+from mpitled.solver.subdomain import Subdomain, localise
 
 _MEASURED = 0.3  # s of steps, and three of them at least
 
@@ -38,15 +38,7 @@ def forecast(deck: Deck, model: Model) -> Forecast:
     with tempfile.TemporaryDirectory() as folder:  # ranks read their part from a file, and so does this one
         path = Path(folder) / "model.h5"
         store.write_model(path, model, "")
-        rows = store.read_part(path, 1, 0)
-    solver, frames, world = deck.solver, deck.output.frames, World()
-    hourglass, rule, precision = deck.hexahedra.hourglass, deck.hexahedra.gradient, PRECISIONS[solver.precision]
-    sub = localise(rows, hourglass, deck.support.stabilisation, rule, precision)
-    method: March | Relaxation
-    if solver.method == "dynamic-relaxation":
-        method = Relaxation(solver, frames, sub, world, None, None)
-    else:
-        method = March(solver, frames, sub, world, None, None, model.figures)
+        _, method = first_rank(deck, path)
     method.warm_up()
     method.begin()
     steps = method.expected_steps
@@ -57,3 +49,14 @@ def forecast(deck: Deck, model: Model) -> Forecast:
         taken += 1
     each = (time.perf_counter() - begin) / taken
     return Forecast(steps, isinstance(method, Relaxation), each, steps * each)
+
+
+def first_rank(deck: Deck, path: Path, ranks: int = 1) -> tuple[Subdomain, March | Relaxation]:
+    """The part of rank 0 of a model that is cut for so many, and its method at rest, which does without the others."""
+    rows, figures = store.read_part(path, ranks, 0), store.read_figures(path)
+    solver, frames, world = deck.solver, deck.output.frames, World()
+    hourglass, rule, precision = deck.hexahedra.hourglass, deck.hexahedra.gradient, PRECISIONS[solver.precision]
+    sub = localise(rows, hourglass, deck.support.stabilisation, rule, precision)
+    if solver.method == "dynamic-relaxation":
+        return sub, Relaxation(solver, frames, sub, world, None, None)
+    return sub, March(solver, frames, sub, world, None, None, figures)
