@@ -45,7 +45,6 @@ element_size = 5.0
 [tumour]
 centre = [0.0, 0.0, 0.0]
 volume = 523.6
-surface_nodes = 400
 [[fixed]]
 nodes = "surface"
 [solver]
