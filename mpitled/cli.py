@@ -89,7 +89,7 @@ def _run(options: argparse.Namespace) -> None:
         if world.leads:
             print(told)
         return
-    made = run(deck, _output(options), world, quiet=options.quiet)
+    made = run(deck, _output(options), world, quiet=options.quiet, resume=options.resume)
     if world.leads and options.quiet:
         for text in made["warnings"]:
             print(f"mpitled: warning: {text}", file=sys.stderr)
