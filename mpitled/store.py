@@ -122,10 +122,11 @@ def model_key(path: Path) -> str | None:
         return None
 
 
-def is_whole_model(path: Path) -> bool:
-    """Whether the model has the checksums that it was written with; reads all of it."""
-    with _open_model(path) as file:
-        return _first_broken(file) is None
+def check_model(path: Path) -> None:
+    """Read all of the model; InputError names what does not have the checksum that it was written with."""
+    with reading(path), _open_model(path) as file:
+        if broken := _first_broken(file):
+            raise InputError(f"{path}: is damaged: {broken} is not what was written")
 
 
 def read_sets(path: Path) -> tuple[dict[str, NDArray[np.int64]], dict[str, NDArray[np.int64]]]:
@@ -218,6 +219,15 @@ def write_columns(path: Path, groups: Mapping[str, Mapping[str, Sequence[float |
                 text = any(isinstance(value, str) for value in values)
                 data: Any = [str(value) for value in values] if text else np.asarray(values, np.float64)
                 group.create_dataset(column, data=data, dtype=h5py.string_dtype() if text else None)
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """What HDF5 stumbles over in a damaged file, as one line that names it."""
+    try:
+        yield
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        raise InputError(f"{path}: is damaged ({' '.join(str(error).split())})") from None
 
 
 @contextmanager
@@ -1043,6 +1053,12 @@ def is_unfinished(directory: Path) -> bool:
     return (Path(directory) / _UNFINISHED).exists()
 
 
+def is_checkpoint(path: Path) -> bool:
+    """Whether the HDF5 file is a checkpoint, of whatever layout; InputError if it is no HDF5 file."""
+    with _open(path) as file, reading(path):
+        return "told" in file and "node" in file
+
+
 def is_result(path: Path) -> bool:
     """Whether the HDF5 file is a result of ours, of whatever layout; InputError if it is no HDF5 file."""
     with _open(path) as file:
@@ -1122,13 +1138,10 @@ def write_checkpoint(
 
 def checkpoint_contents(path: Path) -> dict[str, Any]:
     """What a checkpoint tells. Reads all of it; InputError if it is none of this layout, or not what was written."""
-    with _open(path) as file:
-        try:
-            layout = file.attrs.get("layout") if "told" in file and "node" in file else None
-            if layout == CHECKPOINT_LAYOUT and (broken := _first_broken(file)) is None:
-                return dict(_read_json(file, "told"))
-        except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-            raise InputError(f"{path}: is damaged ({str(error).splitlines()[0]})") from None
+    with _open(path) as file, reading(path):
+        layout = file.attrs.get("layout") if "told" in file and "node" in file else None
+        if layout == CHECKPOINT_LAYOUT and (broken := _first_broken(file)) is None:
+            return dict(_read_json(file, "told"))
     if layout is None:
         raise InputError(f"{path}: is not a checkpoint of mpitled")
     if layout != CHECKPOINT_LAYOUT:

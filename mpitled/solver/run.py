@@ -94,8 +94,12 @@ def build(deck: Deck, directory: Path) -> tuple[Path, bool]:
     """The model of a deck in directory/model.h5, and whether it had to be built: the same deck uses it again."""
     path = directory / MODEL
     key = decks.model_key(deck, included(deck))
-    if store.model_key(path) == key and store.is_whole_model(path):
-        return path, False
+    if store.model_key(path) == key:
+        try:
+            store.check_model(path)
+            return path, False
+        except InputError as error:
+            print(f"note: {error}; it is built anew", file=sys.stderr, flush=True)
     directory.mkdir(parents=True, exist_ok=True)
     from mpitled import preprocess  # only the rank that builds needs the meshers
 
@@ -331,8 +335,10 @@ class _Run:
         if math.isfinite(self.distance):
             self.made["static_distance_mm"] = 1e3 * self.distance
         seconds = self.made["seconds"] | self.phases.seconds
-        writer.close(self.made | {"seconds": seconds})
-        return _report(self.directory, self.world, seconds)
+        with self.phases("close"):
+            writer.close(self.made | {"seconds": seconds})
+        with self.phases("report"):
+            return _report(self.directory, self.world, seconds)
 
     def _advance(self, writer: store.ResultWriter) -> None:
         """Steps, a survey and decisions, and so on to the end of the method."""
