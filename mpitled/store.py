@@ -76,6 +76,7 @@ def write_model(path: Path, model: Model, key: str, scene: Mapping[str, Any] | N
     Arrays are contiguous, so that any range of rows is one read.
     """
     with _replacing(path) as temporary, h5py.File(temporary, "w", locking=False) as file:
+        _room(path, sum(np.asarray(getattr(model, name)).nbytes for name in _MODEL_ARRAYS))
         file.attrs["format"] = "mpitled model"
         file.attrs["layout"] = MODEL_LAYOUT
         file.attrs["key"] = key
@@ -90,6 +91,7 @@ def write_model(path: Path, model: Model, key: str, scene: Mapping[str, Any] | N
         _write_json(file, "figures", model.figures)
         _write_json(file, "remarks", model.remarks)
         _write_json(file, "scene", scene or {})
+        file.flush()  # what fails as a file is closed is not said
 
 
 def read_model(path: Path) -> Model:
@@ -272,8 +274,26 @@ def _told(path: Path) -> Iterator[None]:
     """What the disc refuses, as one line that names the file."""
     try:
         yield
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
         raise InputError(f"{path}: cannot be written ({str(error).splitlines()[0]})") from None
+
+
+def _room(path: Path, size: int) -> None:
+    """InputError if the disc has no room for so many bytes, some of HDF5's own added: HDF5 takes a full disc badly."""
+    needed, free = size + size // 50 + (1 << 16), shutil.disk_usage(Path(path).parent).free
+    if free < needed:
+        raise InputError(
+            f"{path}: cannot be written (it takes {needed / 1e6:.2f} MB, the disc has {free / 1e6:.2f} MB left)"
+        )
+
+
+def _reserve(path: Path) -> None:
+    """Take the room that the file says it has from the disc, so that no write into it finds the disc full."""
+    descriptor = os.open(path, os.O_RDWR)
+    try:
+        os.posix_fallocate(descriptor, 0, os.fstat(descriptor).st_size)
+    finally:
+        os.close(descriptor)
 
 
 def _fsync(path: Path) -> None:
@@ -365,6 +385,7 @@ def write_partition(path: Path, tables: PartTables) -> None:
     rows[np.argsort(owner, kind="stable")] = np.arange(n_nodes)
 
     with _replacing(path) as temporary:
+        _room(path, Path(path).stat().st_size + sum(np.asarray(getattr(tables, f.name)).nbytes for f in fields(tables)))
         shutil.copyfile(path, temporary)
         with h5py.File(temporary, "r+", locking=False) as file:
             name = f"partitions/{tables.n_parts}"
@@ -375,6 +396,7 @@ def write_partition(path: Path, tables: PartTables) -> None:
                 if column.name != "n_parts":
                     _put(group, column.name, getattr(tables, column.name))
             _put(group, "rows", rows)
+            file.flush()
 
 
 def has_partition(path: Path, n_parts: int) -> bool:
@@ -631,7 +653,14 @@ class ResultWriter:
         series: Sequence[str],
         metadata: Mapping[str, Any],
     ) -> None:
-        """A new file with the mesh and no frame."""
+        """A new file with the mesh, no frame, and room for all."""
+        components = sum(point_data.values()) * self._n_points + sum(cell_data.values()) * self._n_cells
+        corners = int((np.array([8, 1, 1]) * self._all_counts[1:]).sum())
+        if self._leads:
+            path.unlink(missing_ok=True)
+            _room(path, 8 * (self._n_frames * components + corners) + 40 * self._n_points + 28 * self._n_cells)
+        if self._comm is not None:
+            self._comm.barrier()
         self._file = _create(path, self._comm)
         self._write_mesh()
         self._make_steps(point_data, cell_data, series)
@@ -642,6 +671,8 @@ class ResultWriter:
         self._note("metadata", metadata)
         self._note("mesh_checksums", self._totals(self._shares))
         self._file.flush()
+        if self._leads:
+            _reserve(path)
 
     def _take_over(self, old: Result, frames: int, series: Sequence[str]) -> None:
         """Write the first frames of a file that was written in other parts."""
@@ -1108,6 +1139,9 @@ def write_checkpoint(
     new = path.with_name(f".{path.name}")
     slabs, transfer, shares = [(part.first_row, int(part.owned.sum()))], _collective(comm), {}
     with _told(path):
+        if part.part == 0:
+            components = sum(values.shape[1] for values in nodal.values())
+            _room(path, 8 * part.n_nodes * (1 + components) + 8 * part.n_parts * len(own) + len(str(told)))
         # The latest format has checksums of its own for what is not data.
         with _create(new, comm, libver="latest") as file:
             file.attrs["layout"] = CHECKPOINT_LAYOUT
@@ -1124,6 +1158,7 @@ def write_checkpoint(
             for name in shares:
                 file[name].attrs["checksum"] = checksum.total(of_rank[name] for of_rank in every)
             _write_json(file, "told", dict(told) if comm is None else comm.bcast(dict(told)))
+            file.flush()
         _fsync(new)
         if comm is not None:
             comm.barrier()
@@ -1165,7 +1200,8 @@ def read_checkpoint(path: Path, nodes: NDArray[np.int64]) -> tuple[dict[str, NDA
 def discard_checkpoints(directory: Path) -> bool:
     """Remove the checkpoints of a run, if there are any: whether there were."""
     paths = [Path(directory) / name for name in (f".{CHECKPOINTS[0]}", *CHECKPOINTS)]
-    there = any(path.exists() for path in paths)
-    for path in paths:
-        path.unlink(missing_ok=True)
-    return there
+    there = [path for path in paths if path.exists()]
+    for path in there:
+        with _told(path):
+            path.unlink()
+    return bool(there)

@@ -100,7 +100,10 @@ def build(deck: Deck, directory: Path) -> tuple[Path, bool]:
             return path, False
         except InputError as error:
             print(f"note: {error}; it is built anew", file=sys.stderr, flush=True)
-    directory.mkdir(parents=True, exist_ok=True)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{directory}: cannot be made ({error.strerror}); give another folder with --out") from None
     from mpitled import preprocess  # only the rank that builds needs the meshers
 
     store.write_model(path, preprocess.build(deck), key, decks.canonical(deck))
@@ -322,8 +325,9 @@ class _Run:
                 self.distance = self.method.best if self.method.stalled else self.method.distance
                 with everywhere():
                     self._end_if_stalled(self.method)
-        except MpitledError:
-            writer.abandon(self.made or self._run_figures(time.perf_counter() - begin))
+        except MpitledError as error:
+            if error.everywhere:  # else the others do not know of it
+                writer.abandon(self.made or self._run_figures(time.perf_counter() - begin))
             raise
         finally:
             interrupts.looked_for, interrupts.when = (
