@@ -390,6 +390,13 @@ class Faults:
         assert Job(folder, LD_PRELOAD=str(library)).end() == 0
         self.resumes(folder)
 
+    def otherwise(self, **variables: str) -> None:
+        """From the start, model and all, in another environment."""
+        folder = self.folder("otherwise", None)
+        assert Job(folder, 2, **variables).end() == 0
+        self.resumes(folder)
+        assert (folder / "model.h5").read_bytes() == (self.top / "whole_2" / "model.h5").read_bytes()
+
     def another_partition(self) -> None:
         folder = self.interrupted("partition")
         code = "from mpitled.cli import main; main()"
@@ -485,17 +492,14 @@ def inject(top: Path, n_kills: int = 100, seed: int = 0) -> Faults:
         [lambda chain=chain, n=1 + (i % 3 > 0): faults.kills(chain, n) for i, chain in enumerate(chains)],
     )  # fmt: skip
     assert len(faults.rows) == begin + 1
-    faults.tried(
-        "SIGUSR1", "loop", [lambda n=n: faults.signalled(signal.SIGUSR1, n) for n in ((2,) if few else (1, 2, 2))]
-    )
-    if not few:
-        faults.tried("SIGTERM", "loop", [lambda n=n: faults.signalled(signal.SIGTERM, n) for n in (1, 2, 2)])
     orders = [[2, 1]] if few else [[1, 2, 3, 4], [4, 3, 2, 1], [2, 4, 1, 3]]
     faults.tried("killed, continued on other ranks", "loop", [lambda o=o: faults.other_ranks(o) for o in orders])
-    harms = [faults.flip] if few else [faults.flip, faults.flip, faults.cut]
-    faults.tried("last checkpoint damaged", "resume", [lambda harm=harm: faults.damaged(harm) for harm in harms])
     if few:
         return faults
+    for name, which in (("SIGUSR1", signal.SIGUSR1), ("SIGTERM", signal.SIGTERM)):
+        faults.tried(name, "loop", [lambda n=n, which=which: faults.signalled(which, n) for n in (1, 2, 2)])
+    harms = [faults.flip, faults.flip, faults.cut]
+    faults.tried("last checkpoint damaged", "resume", [lambda harm=harm: faults.damaged(harm) for harm in harms])
     faults.tried("both checkpoints damaged", "resume", [lambda: faults.damaged(faults.flip, both=True)])
     faults.tried("rank stopped for 5 s", "loop", [lambda r=r: faults.stopped(r, [(5, 0)]) for r in (0, 1)])
     faults.tried("rank slow by 10x", "loop", [lambda r=r: faults.stopped(r, [(0.09, 0.01)] * 50) for r in (0, 1)])
@@ -514,6 +518,9 @@ def inject(top: Path, n_kills: int = 100, seed: int = 0) -> Faults:
         faults.tried(
             "read-only folder", "start, resume", [lambda late=late: faults.read_only(late) for late in (False, True)]
         )
+    more = {"OMP_NUM_THREADS": "2", "NUMBA_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
+    faults.tried("two threads a rank", "always", [lambda: faults.otherwise(**more)])
+    faults.tried("kernels compiled anew", "always", [lambda: faults.otherwise(NUMBA_CACHE_DIR=str(top / "kernels"))])
     if shutil.which("gcc"):
         faults.tried("clock leaps by a day", "always", [faults.clock])
     return faults
