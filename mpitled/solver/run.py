@@ -6,7 +6,6 @@ import importlib.metadata
 import logging
 import math
 import resource
-import signal
 import sys
 import time
 from collections import deque
@@ -28,6 +27,7 @@ from mpitled.solver import checkpoint
 from mpitled.solver.halo import Halo, World
 from mpitled.solver.march import March
 from mpitled.solver.memory import Kept, Memory, Parts, recall, remember
+from mpitled.solver.progress import Interrupts, Phases, Progress
 from mpitled.solver.relaxation import Relaxation
 from mpitled.solver.step import State, Term
 from mpitled.solver.subdomain import Subdomain, localise
@@ -46,48 +46,8 @@ DONE = "done"
 #: What a run is asked at a look: nothing, to keep a checkpoint, to keep one and end.
 KEEP, END = 1, 2
 
-#: What ends a run in order. mpirun ends its ranks itself, within a second, when it gets one of the first two; the third
-#: it passes on.
-INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
 
 _log = logging.getLogger(__name__)
-
-
-class Phases:
-    """Wall time of each phase of a run, s."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        begin = time.perf_counter()
-        if name not in self.seconds:
-            _log.info("%s", name)
-        yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
-
-
-class Interrupts:
-    """Signals that end a run in order: at its next look, or where there are no looks at once, by the first rank."""
-
-    def __init__(self, world: World) -> None:
-        self.asked, self.looked_for = False, False
-        self.when = "before the first step; nothing is lost"
-        self._leads = world.leads
-
-    def __enter__(self) -> Interrupts:
-        self._previous = {which: signal.signal(which, self._note) for which in INTERRUPTS}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for which, handler in self._previous.items():
-            signal.signal(which, handler)
-
-    def _note(self, signum: int, frame: object) -> None:
-        self.asked = True
-        if self._leads and not self.looked_for:
-            raise InterruptedRun(f"interrupted {self.when}")
 
 
 def build(deck: Deck, directory: Path) -> tuple[Path, bool]:
@@ -263,7 +223,7 @@ class _Run:
             self.method = self._relaxation()
         else:
             self.method = March(solver, frames, sub, world, self.force_halo, self._halo(1), model)
-        self.progress = None if quiet or not world.leads else _Progress()
+        self.progress = None if quiet or not world.leads else Progress()
         self.about, self.found, self.interrupts = about, found, Interrupts(world)
         self.term_seconds: dict[str, float] = {}
         self.distance = math.nan
@@ -609,36 +569,3 @@ _SERIES = (
     "external", "strain", "hourglass", "stabilisation", "kinetic", "added", "added_mass", "dissipated", "min_jacobian",
     "step_ratio", "balance_error", "kinetic_ratio",
 )  # fmt: skip
-
-
-class _Progress:
-    """How far the run is, on stderr: a bar on a terminal, a line every tenth elsewhere."""
-
-    def __init__(self) -> None:
-        self.begin, self.tenth, self.bar = time.perf_counter(), 0, None
-        if sys.stderr.isatty():
-            try:
-                from tqdm import tqdm
-            except ImportError:
-                return
-            self.bar = tqdm(total=1.0, bar_format="{percentage:3.0f}%|{bar}| {remaining} left{postfix}")
-
-    def show(self, done: float, step: int, figures: dict[str, float]) -> None:
-        rate = step / max(time.perf_counter() - self.begin, 1e-9)
-        state = (
-            f"{rate:.0f} steps/s, kinetic/internal {figures['kinetic_ratio']:.1e}, min J {figures['min_jacobian']:.3f}"
-        )
-        if self.bar is not None:
-            self.bar.set_postfix_str(state, refresh=False)
-            self.bar.update(max(0.0, done - self.bar.n))
-        elif int(10 * done) > self.tenth:
-            self.tenth = int(10 * done)
-            left = (1 - done) / done * (time.perf_counter() - self.begin)
-            print(f"{done:4.0%}  {left:5.0f} s left  {state}", file=sys.stderr, flush=True)
-
-    def tell(self, words: str) -> None:
-        print(f"note: {words}", file=sys.stderr, flush=True)
-
-    def close(self) -> None:
-        if self.bar is not None:
-            self.bar.close()
