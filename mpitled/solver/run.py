@@ -433,7 +433,7 @@ class _Run:
         if relaxation.stalled:
             raise UnstableError(
                 f"the relaxation comes no nearer to the static solution than {1e3 * relaxation.best:.2g} mm, by its "
-                f"own estimate; give solver.tolerance = {1.5e3 * relaxation.best:.2g} or more"
+                f"own estimate; give solver.tolerance = {3e3 * relaxation.best:.2g} or more"
                 + (", or solver.precision = double" if self.deck.solver.precision == "single" else "")
             )
 
