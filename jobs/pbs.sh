@@ -11,7 +11,7 @@ cd "${PBS_O_WORKDIR:-.}"
 # module load openmpi hdf5
 . jobs/environment.sh
 
-seconds=${RUN_SECONDS:-7080} # two minutes less than the walltime: the run then ends itself, and what it wrote can be read
+seconds=${RUN_SECONDS:-7080} # two minutes less than the walltime: the run keeps a checkpoint and ends; the same job goes on
 deck=$DECK
 set -- ${SET:+--set "$SET"}
 out=${OUT:-out/$(basename "$deck" .toml)}
@@ -22,4 +22,4 @@ mpitled build "$deck" --out "$out" "$@" # on one core; a model that is there alr
 
 # mpirun passes the signal on to every rank.
 timeout --signal=USR1 --preserve-status "$seconds" \
-    mpirun -n "$ranks" ${PBS_NODEFILE:+--hostfile "$PBS_NODEFILE"} mpitled run "$deck" --out "$out" "$@"
+    mpirun -n "$ranks" ${PBS_NODEFILE:+--hostfile "$PBS_NODEFILE"} mpitled run "$deck" --out "$out" --resume "$@"

@@ -7,7 +7,7 @@
 #SBATCH --cpus-per-task=1
 #SBATCH --hint=nomultithread
 #SBATCH --time=02:00:00
-#SBATCH --signal=B:USR1@120 # two minutes before the time is up the run ends itself, and what it wrote can be read
+#SBATCH --signal=B:USR1@120 # two minutes before the time is up the run keeps a checkpoint and ends; the same job goes on from it
 set -euo pipefail
 cd "${SLURM_SUBMIT_DIR:-.}"
 # module load openmpi hdf5
@@ -22,7 +22,7 @@ mpitled build "$deck" --out "$out" "$@" # on one core; a model that is there alr
 
 launch=(srun --mpi=pmix)
 command -v srun >/dev/null || launch=(mpirun -n "$ranks")
-"${launch[@]}" mpitled run "$deck" --out "$out" "$@" &
+"${launch[@]}" mpitled run "$deck" --out "$out" --resume "$@" &
 job=$!
 trap 'kill -USR1 "$job"' USR1 # srun and mpirun pass it on to every rank
 status=0

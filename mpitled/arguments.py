@@ -33,6 +33,7 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
     _deck(run)
     run.add_argument("-v", "--verbose", action="store_true", help="also each phase as it begins, with its rank")
     run.add_argument("-q", "--quiet", action="store_true", help="no progress and no table")
+    run.add_argument("--resume", action="store_true", help="go on from the last checkpoint; from the start without one")
     run.add_argument("--dry", action="store_true", help="say what would be done, and how long it would take; no step")
 
     sweep = command("sweep", "a table over values of keys, a run for each; goes on where it was stopped", json=True)
@@ -136,7 +137,9 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
     export.add_argument("--out", type=Path, metavar="DIR", help="folder of the decks (export beside the model)")
 
     info = command("info", "versions of what mpitled works with, and what is missing; or of a file", json=True)
-    info.add_argument("file", type=Path, nargs="?", help="model.h5 or result.vtkhdf: say what it is and holds")
+    info.add_argument(
+        "file", type=Path, nargs="?", help="model, result or checkpoint: what it holds, and whether it is whole"
+    )
     return made
 
 

@@ -37,6 +37,8 @@ def main(words: Sequence[str] | None = None) -> NoReturn:
         _end(error, error.status)
     except BrokenPipeError:
         os._exit(1)
+    except ImportError as error:
+        _missing(error)
     except Exception as error:
         traceback.print_exc()
         _end(error, 1)
@@ -54,6 +56,16 @@ def _end(error: Exception, status: int) -> NoReturn:
         sys.exit(status)
     print(f"mpitled: rank {world.rank}: {error}", file=sys.stderr, flush=True)
     world.abort(status)
+
+
+def _missing(error: ImportError) -> NoReturn:
+    """A library that is not there or cannot be loaded, maybe the one that ranks speak through."""
+    print(f"mpitled: {error}; 'mpitled info' says what is missing and how to get it", file=sys.stderr, flush=True)
+    if "mpi4py.MPI" in sys.modules:
+        from mpitled.solver.halo import World
+
+        World().abort(2)
+    sys.exit(2)
 
 
 def _log_phases() -> None:
@@ -98,7 +110,7 @@ def _run(options: argparse.Namespace) -> None:
         if world.leads:
             print(told)
         return
-    made = run(deck, _output(options), world, quiet=options.quiet)
+    made = run(deck, _output(options), world, quiet=options.quiet, resume=options.resume)
     if world.leads and options.quiet:
         for text in made["warnings"]:
             print(f"mpitled: warning: {text}", file=sys.stderr)

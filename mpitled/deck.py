@@ -12,7 +12,7 @@ import math
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, Field, asdict, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, Field, asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
@@ -287,6 +287,10 @@ class Output:
 
     frames: int = key("frames over the load, the undeformed one not counted", 10, limits="[1, inf)")
     pictures: bool = key("draw the deformed body", True)
+    checkpoint_minutes: float = key(
+        "time from one checkpoint to the next, for `run --resume`; 0: only when the run is interrupted", 10.0, "min",
+        "[0, inf)",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -701,8 +705,11 @@ def _check_tumour(deck: Deck, given: dict[str, Any], source: _Source) -> None:
 # --- what others make of the deck ----------------------------------------------------------------------------------
 
 
-def canonical(deck: Deck) -> dict[str, Any]:
-    """Every value that took effect, defaults too, in the deck's layout and units; ready for JSON or TOML."""
+def canonical(deck: Deck, *, paths: bool = True) -> dict[str, Any]:
+    """Every value that took effect, defaults too, in the deck's layout and units; ready for JSON or TOML.
+
+    Without paths: a file may have been moved, and be the same.
+    """
 
     def plain(section: Any) -> dict[str, Any]:
         table: dict[str, Any] = {}
@@ -715,7 +722,7 @@ def canonical(deck: Deck) -> dict[str, Any]:
                     table[written] = {entry.name: plain(entry) for entry in value}
                 elif value:
                     table[written] = [plain(entry) for entry in value]
-            elif value is not None:
+            elif value is not None and (paths or not isinstance(value, Path)):
                 plain_value = str(value) if isinstance(value, Path) else value
                 table[written] = _in_unit(plain_value, declared.metadata["key"].unit)
         return table
@@ -731,6 +738,30 @@ def recorded(table: Mapping[str, Any], path: Path) -> Deck:
     return deck
 
 
+def difference(deck: Deck, earlier: dict[str, Any]) -> str:
+    """The first key that matters to the result and differs from what was `canonical` without paths; "" if none does."""
+    now, then = (dict(_flat(table)) for table in (json.loads(json.dumps(canonical(deck, paths=False))), earlier))
+    for name in dict.fromkeys([*then, *now]):
+        if name not in _HARMLESS and now.get(name) != then.get(name):
+            before, after = (_show(of[name]) if name in of else "not there" for of in (then, now))
+            return f"{name} = {before}, and not {after}"
+    return ""
+
+
+_HARMLESS = ("title", "output.pictures", "output.checkpoint_minutes")
+
+
+def _flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    if isinstance(value, dict):
+        for part, inner in value.items():
+            yield from _flat(inner, f"{name}.{part}" if name else part)
+    elif isinstance(value, list) and value and isinstance(value[0], dict):
+        for i, inner in enumerate(value):
+            yield from _flat(inner, f"{name}.{i}")
+    else:
+        yield name, value
+
+
 _MODEL = (*GEOMETRIES, "tumour", "cloud", "support", "hexahedra", "spheres", "materials", "fixed", "displaced")
 
 
@@ -744,7 +775,8 @@ def model_key(deck: Deck, included: Sequence[Path] = ()) -> str:
 
 def scene_key(deck: Deck, included: Sequence[Path] = ()) -> str:
     """What determines the result, whatever the program: all sections, like `model_key`."""
-    return _content(deck, (f.name for f in fields(deck) if f.name not in ("title", "path")), included)
+    harmless = replace(deck, output=replace(deck.output, checkpoint_minutes=0.0))
+    return _content(harmless, (f.name for f in fields(deck) if f.name not in ("title", "path")), included)
 
 
 def _content(deck: Deck, names: Iterable[str], included: Sequence[Path], **more: str) -> str:

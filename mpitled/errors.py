@@ -21,6 +21,6 @@ class UnstableError(MpitledError):
 
 
 class InterruptedRun(MpitledError):
-    """Ended from outside (Ctrl-C, SIGTERM); what was written is readable."""
+    """Ended from outside (Ctrl-C, SIGTERM); what was written is readable, and the run can go on from there."""
 
     status = 4

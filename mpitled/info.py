@@ -47,14 +47,30 @@ def versions() -> dict[str, str | None]:
 
 
 def contents(path: Path) -> dict[str, Any]:
-    """What a model or a result is and holds, as JSON can hold it. InputError if it is neither."""
+    """What a model, a result or a checkpoint is and holds, as JSON can hold it, after all of it was read.
+
+    InputError if it is none of these, or damaged.
+    """
     from mpitled import store
 
     if path.is_dir():
         raise InputError(f"{path}: is a folder; give a file in it, model.h5 or result.vtkhdf")
+    with store.reading(path):
+        return _contents(path)
+
+
+def _contents(path: Path) -> dict[str, Any]:
+    from mpitled import store
+
     if store.model_key(path) is not None:
+        store.check_model(path)
         return {"kind": "model", "path": str(path), **store.model_contents(path)}
+    if store.is_checkpoint(path):
+        told = store.checkpoint_contents(path)
+        names = ("version", "ranks", "step", "share", "frames")
+        return {"kind": "checkpoint", "path": str(path)} | {name: told[name] for name in names}
     with store.open_result(path) as result:
+        result.check()
         metadata, times = result.metadata, result.times
         n_hexahedra = len(result.hexahedra)
         return {
@@ -79,7 +95,15 @@ def describe(path: Path) -> str:
     if has["kind"] == "model":
         from mpitled import store
 
-        return f"{path}: a model of mpitled\n{store.describe_model(path)}"
+        return f"{path}: a whole model of mpitled\n{store.describe_model(path)}"
+    if has["kind"] == "checkpoint":
+        lines = [
+            f"{path}: a whole checkpoint of mpitled {has['version']}",
+            f"step             {has['step']}, {has['share']:.1%} of the run",
+            f"frames           {has['frames']}",
+            f"ranks            {has['ranks']}",
+        ]
+        return "\n".join(lines)
     lines = [
         f"{path}: {'a whole' if has['complete'] else 'an unfinished'} result of mpitled",
         f"title            {has['title']}",

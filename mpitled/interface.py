@@ -37,10 +37,16 @@ def build_model(deck: Deck) -> Model:
 
 
 def run_deck(
-    deck: Deck | str | Path, directory: str | Path, overrides: Sequence[str] = (), *, quiet: bool = True
+    deck: Deck | str | Path,
+    directory: str | Path,
+    overrides: Sequence[str] = (),
+    *,
+    quiet: bool = True,
+    resume: bool = False,
 ) -> Any:
     """Compute a deck into a directory on this process, or on all ranks under mpirun; its report, as report.json has it.
 
+    With `resume` it goes on from the last checkpoint in the directory, from the start where there is none.
     Overrides, "section.key=value", are for a deck that is given as a path. InputError, UnstableError or
     InterruptedRun, alike on all ranks.
     """
@@ -48,7 +54,7 @@ def run_deck(
         deck = load_deck(deck, overrides)
     elif overrides:
         raise InputError("overrides: are for a deck given as a path; give them to load_deck")
-    return runs.run(deck, Path(directory), World(), quiet=quiet)
+    return runs.run(deck, Path(directory), World(), quiet=quiet, resume=resume)
 
 
 def open_result(path: str | Path) -> RunResult:

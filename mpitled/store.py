@@ -1,4 +1,4 @@
-"""Every HDF5 layout: the model, its partitions, and the results as VTKHDF."""
+"""Every HDF5 layout: the model, its partitions, the results as VTKHDF, and checkpoints; all with checksums."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from mpitled import checksum
 from mpitled.errors import InputError
 from mpitled.material import Material
 from mpitled.model import Model
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
 #: Written into every model; a file of another layout is built anew, never read by guess.
 MODEL_LAYOUT = 2
 
-#: A file of results of another layout is refused too.
-RESULT_LAYOUT = 1
+#: Files of results and checkpoints of another layout are refused too.
+RESULT_LAYOUT, CHECKPOINT_LAYOUT = 1, 1
 
 #: Bytes that are read over rather than skipped: about what one more call of HDF5 costs (70 us at 3.5 GB/s).
 _GAP_BYTES = 1 << 18
@@ -75,20 +76,22 @@ def write_model(path: Path, model: Model, key: str, scene: Mapping[str, Any] | N
     Arrays are contiguous, so that any range of rows is one read.
     """
     with _replacing(path) as temporary, h5py.File(temporary, "w", locking=False) as file:
+        _room(path, sum(np.asarray(getattr(model, name)).nbytes for name in _MODEL_ARRAYS))
         file.attrs["format"] = "mpitled model"
         file.attrs["layout"] = MODEL_LAYOUT
         file.attrs["key"] = key
         file.attrs["n_fe_nodes"] = model.n_fe_nodes
         for name, dtype in _MODEL_ARRAYS.items():
-            file.create_dataset(name, data=np.asarray(getattr(model, name), dtype))
+            _put(file, name, np.asarray(getattr(model, name), dtype))
         if model.surface_areas is not None:
-            file["surface_areas"] = model.surface_areas
+            _put(file, "surface_areas", model.surface_areas)
         for name in ("node_sets", "cell_sets"):
             _write_sets(file.create_group(name), getattr(model, name))
         _write_json(file, "materials", [asdict(material) for material in model.materials])
         _write_json(file, "figures", model.figures)
         _write_json(file, "remarks", model.remarks)
         _write_json(file, "scene", scene or {})
+        file.flush()  # what fails as a file is closed is not said
 
 
 def read_model(path: Path) -> Model:
@@ -119,6 +122,13 @@ def model_key(path: Path) -> str | None:
             return str(file.attrs["key"])
     except InputError:
         return None
+
+
+def check_model(path: Path) -> None:
+    """Read all of the model; InputError names what does not have the checksum that it was written with."""
+    with reading(path), _open_model(path) as file:
+        if broken := _first_broken(file):
+            raise InputError(f"{path}: is damaged: {broken} is not what was written")
 
 
 def read_sets(path: Path) -> tuple[dict[str, NDArray[np.int64]], dict[str, NDArray[np.int64]]]:
@@ -214,6 +224,15 @@ def write_columns(path: Path, groups: Mapping[str, Mapping[str, Sequence[float |
 
 
 @contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """What HDF5 stumbles over in a damaged file, as one line that names it."""
+    try:
+        yield
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        raise InputError(f"{path}: is damaged ({' '.join(str(error).split())})") from None
+
+
+@contextmanager
 def _open_model(path: Path) -> Iterator[h5py.File]:
     with _open(path) as file:
         if file.attrs.get("format") != "mpitled model":
@@ -255,8 +274,26 @@ def _told(path: Path) -> Iterator[None]:
     """What the disc refuses, as one line that names the file."""
     try:
         yield
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
         raise InputError(f"{path}: cannot be written ({str(error).splitlines()[0]})") from None
+
+
+def _room(path: Path, size: int) -> None:
+    """InputError if the disc has no room for so many bytes, some of HDF5's own added: HDF5 takes a full disc badly."""
+    needed, free = size + size // 50 + (1 << 16), shutil.disk_usage(Path(path).parent).free
+    if free < needed:
+        raise InputError(
+            f"{path}: cannot be written (it takes {needed / 1e6:.2f} MB, the disc has {free / 1e6:.2f} MB left)"
+        )
+
+
+def _reserve(path: Path) -> None:
+    """Take the room that the file says it has from the disc, so that no write into it finds the disc full."""
+    descriptor = os.open(path, os.O_RDWR)
+    try:
+        os.posix_fallocate(descriptor, 0, os.fstat(descriptor).st_size)
+    finally:
+        os.close(descriptor)
 
 
 def _fsync(path: Path) -> None:
@@ -271,8 +308,8 @@ def _write_sets(group: h5py.Group, sets: dict[str, NDArray[np.int64]]) -> None:
     # Names go beside the numbers: a set of an input file may be called what HDF5 cannot.
     _write_json(group, "names", list(sets))
     members = [np.asarray(members, np.int64) for members in sets.values()]
-    group["offsets"] = np.cumsum([0, *map(len, members)], dtype=np.int64)
-    group["members"] = np.concatenate([np.empty(0, np.int64), *members])
+    _put(group, "offsets", np.cumsum([0, *map(len, members)], dtype=np.int64))
+    _put(group, "members", np.concatenate([np.empty(0, np.int64), *members]))
 
 
 def _read_sets(group: h5py.Group) -> dict[str, NDArray[np.int64]]:
@@ -284,11 +321,43 @@ def _read_sets(group: h5py.Group) -> dict[str, NDArray[np.int64]]:
 def _write_json(group: h5py.Group, name: str, value: Any) -> None:
     # numpy's numbers become Python's.
     text = json.dumps(value, default=lambda number: number.item()).encode()
-    group.create_dataset(name, data=np.bytes_(text))
+    _put(group, name, np.bytes_(text))
 
 
 def _read_json(group: h5py.Group, name: str) -> Any:
-    return json.loads(group[name][()])
+    text = group[name]
+    if text.attrs.get("checksum", _sum(text)) != _sum(text):
+        raise InputError(f"{group.file.filename}: {text.name} is not what was written; the file is damaged")
+    return json.loads(text[()])
+
+
+def _put(group: h5py.Group, name: str, values: Any) -> None:
+    """A dataset with its checksum."""
+    dataset = group.create_dataset(name, data=values)
+    dataset.attrs["checksum"] = checksum.total([checksum.share(np.asarray(values), 0)])
+
+
+def _sum(dataset: h5py.Dataset, first: int = 0, count: int | None = None) -> int:
+    """Checksum of `count` rows, read block by block."""
+    if not dataset.shape:
+        return checksum.total([checksum.share(np.asarray(dataset[()]), 0)])
+    last = len(dataset) if count is None else first + count
+    entries = int(np.prod(dataset.shape[1:]))
+    rows = max(1, _BLOCK_BYTES // max(1, entries * dataset.dtype.itemsize))
+    return checksum.total(
+        checksum.share(dataset[start : min(start + rows, last)], (start - first) * entries)
+        for start in range(first, last, rows)
+    )
+
+
+def _first_broken(file: h5py.File) -> str | None:
+    """The first dataset that has another checksum than it was written with."""
+
+    def look(name: str, thing: h5py.Group | h5py.Dataset) -> str | None:
+        there = isinstance(thing, h5py.Dataset) and "checksum" in thing.attrs
+        return name if there and thing.attrs["checksum"] != _sum(thing) else None
+
+    return file.visititems(look)
 
 
 def _read_materials(file: h5py.File) -> tuple[Material, ...]:
@@ -316,6 +385,7 @@ def write_partition(path: Path, tables: PartTables) -> None:
     rows[np.argsort(owner, kind="stable")] = np.arange(n_nodes)
 
     with _replacing(path) as temporary:
+        _room(path, Path(path).stat().st_size + sum(np.asarray(getattr(tables, f.name)).nbytes for f in fields(tables)))
         shutil.copyfile(path, temporary)
         with h5py.File(temporary, "r+", locking=False) as file:
             name = f"partitions/{tables.n_parts}"
@@ -324,14 +394,25 @@ def write_partition(path: Path, tables: PartTables) -> None:
             group = file.create_group(name)
             for column in fields(tables):
                 if column.name != "n_parts":
-                    group[column.name] = getattr(tables, column.name)
-            group["rows"] = rows
+                    _put(group, column.name, getattr(tables, column.name))
+            _put(group, "rows", rows)
+            file.flush()
 
 
 def has_partition(path: Path, n_parts: int) -> bool:
     """Whether the model can be read in so many parts; one part needs no partition."""
     with _open_model(path) as file:
         return n_parts == 1 or f"partitions/{n_parts}" in file
+
+
+def partition_mark(path: Path, n_parts: int) -> str:
+    """What tells partitions in as many parts from each other. InputError if there is none."""
+    with _open_model(path) as file:
+        if n_parts == 1:
+            return "whole"
+        if f"partitions/{n_parts}" not in file:
+            raise InputError(f"{path}: has no partition in {n_parts} parts; partition the model first")
+        return f"{n_parts}:{int(file[f'partitions/{n_parts}/nodes'].attrs['checksum']) % (1 << 64):016x}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -511,9 +592,12 @@ class ResultWriter:
         point_data: Mapping[str, int] = MappingProxyType({"displacement": 3, "field_displacement": 3}),
         cell_data: Mapping[str, int] = MappingProxyType({"J": 1}),
         series: Sequence[str] = (),
+        frames: int = 0,
     ) -> None:
-        """Write the mesh and make room for `n_frames` frames at most.
+        """Write the mesh and make room for `n_frames` frames at most, or go on with an unfinished file.
 
+        Of the unfinished file in the directory so many `frames` are kept: as they are where it was written in the same
+        parts, which the metadata's "partition" says, else in a new file, by global numbers.
         `comm` is an MPI communicator whose ranks are the parts in order, or None. `metadata` is what JSON can hold;
         rank 0's is kept. `point_data` and `cell_data` give the components of what each frame holds; `series` names
         the numbers of each frame. InputError, from here on, if the file cannot be written.
@@ -526,23 +610,88 @@ class ResultWriter:
         self._announced = {*point_data, *cell_data, *series}
         self._path = Path(directory) / _FINISHED
         self._partial = Path(directory) / _UNFINISHED
-        self._transfer = None
+        self._transfer = _collective(comm)
+        self._shares: dict[str, int] = {}  # of this rank, to the checksums of what is written once
+        self._count()
         with _told(self._partial):
             if self._leads:
                 Path(directory).mkdir(parents=True, exist_ok=True)
-            if comm is None:
-                self._file = h5py.File(self._partial, "w", locking=False)
-            else:
+            if comm is not None:
                 comm.barrier()
-                self._transfer = h5py.h5p.create(h5py.h5p.DATASET_XFER)
-                self._transfer.set_dxpl_mpio(h5py.h5fd.MPIO_COLLECTIVE)
-                self._file = h5py.File(self._partial, "w", driver="mpio", comm=comm)
-            self._write_mesh()
-            self._make_steps(point_data, cell_data, series)
-            ours = self._file.create_group("mpitled")
-            ours.attrs["layout"] = RESULT_LAYOUT
-            self._note("metadata", metadata)
-            self._file.flush()
+            if not frames:
+                self._begin(self._partial, point_data, cell_data, series, metadata)
+                return
+        with open_result(self._partial) as old:
+            if old.n_frames < frames:
+                raise InputError(
+                    f"{self._partial}: holds {old.n_frames} frames of {frames}; begin anew, without --resume"
+                )
+            if old.metadata["partition"] != metadata["partition"]:
+                new = self._partial.with_name(f".{self._partial.name}")
+                with _told(new):
+                    self._begin(new, point_data, cell_data, series, metadata)
+                self._take_over(old, frames, series)
+                if self._leads:
+                    with _told(new):
+                        _fsync(new)
+                        os.replace(new, self._partial)
+                return
+        if comm is not None:
+            comm.barrier()
+        with _told(self._partial):
+            self._file = _create(self._partial, comm, "r+")
+            self._frame = frames
+            if "figures" in self._file["mpitled"]:
+                del self._file["mpitled/figures"]
+            self._announce(frames)
+
+    def _begin(
+        self,
+        path: Path,
+        point_data: Mapping[str, int],
+        cell_data: Mapping[str, int],
+        series: Sequence[str],
+        metadata: Mapping[str, Any],
+    ) -> None:
+        """A new file with the mesh, no frame, and room for all."""
+        components = sum(point_data.values()) * self._n_points + sum(cell_data.values()) * self._n_cells
+        corners = int((np.array([8, 1, 1]) * self._all_counts[1:]).sum())
+        if self._leads:
+            path.unlink(missing_ok=True)
+            _room(path, 8 * (self._n_frames * components + corners) + 40 * self._n_points + 28 * self._n_cells)
+        if self._comm is not None:
+            self._comm.barrier()
+        self._file = _create(path, self._comm)
+        self._write_mesh()
+        self._make_steps(point_data, cell_data, series)
+        ours = self._file.create_group("mpitled")
+        ours.attrs["layout"] = RESULT_LAYOUT
+        for name in (*(f"PointData/{n}" for n in point_data), *(f"CellData/{n}" for n in cell_data), "series"):
+            _make(ours, f"checksums/{name}", (self._n_frames,), np.int64)
+        self._note("metadata", metadata)
+        self._note("mesh_checksums", self._totals(self._shares))
+        self._file.flush()
+        if self._leads:
+            _reserve(path)
+
+    def _take_over(self, old: Result, frames: int, series: Sequence[str]) -> None:
+        """Write the first frames of a file that was written in other parts."""
+        part = self._part
+        nodes, in_nodes = old.find("node_id", part.nodes[part.owned])
+        cells, in_cells = old.find("cell_id", part.cells)
+        points = old.point_rows(in_cells[cells][len(part.hexahedra) :])
+        order = np.argsort(points)
+        back = np.argsort(order)
+        for k in range(frames):
+            point_data = {
+                name: np.concatenate([
+                    old.rows("Point", name, k, in_nodes)[nodes], old.rows("Point", name, k, points[order])[back]
+                ])
+                for name in old.names("Point")
+            }  # fmt: skip
+            cell_data = {name: old.rows("Cell", name, k, in_cells)[cells] for name in old.names("Cell")}
+            numbers = {name: float(old.series[name][k]) for name in series}
+            self.write_frame(float(old.times[k]), point_data, cell_data, numbers)
 
     @property
     def _leads(self) -> bool:
@@ -564,24 +713,40 @@ class ResultWriter:
             raise ValueError(f"{self._n_frames} frames were announced, and one more is written")
         if {*point_data, *cell_data, *(series or {})} != self._announced:
             raise ValueError(f"every frame holds {', '.join(sorted(self._announced))}")
-        grid, steps = self._file["VTKHDF"], self._file["VTKHDF/Steps"]
+        grid = self._file["VTKHDF"]
         point_row, cell_row = self._frame * self._n_points, self._frame * self._n_cells
+        shares = {"series": checksum.share(_series(time, series or {}), 0) if self._leads else 0}
         with _told(self._partial):
             for name, values in point_data.items():
-                self._write(grid["PointData"][name], self._point_slabs, values, point_row)
+                shares[f"PointData/{name}"] = self._write(grid["PointData"][name], self._point_slabs, values, point_row)
             for name, values in cell_data.items():
-                self._write(grid["CellData"][name], self._cell_slabs, self._with_efg(values, np.nan), cell_row)
+                shares[f"CellData/{name}"] = self._write(
+                    grid["CellData"][name], self._cell_slabs, self._with_efg(values, np.nan), cell_row
+                )
+            totals = self._totals(shares)
             if self._leads:
                 for name, value in (series or {}).items():
                     grid["FieldData"][name][self._frame] = value
+                for name, total in totals.items():
+                    self._file[f"mpitled/checksums/{name}"][self._frame] = total
             self._file.flush()
             self._frame += 1
-            # Together, and before the next flush: VTK reads all times into room for NSteps of them.
-            steps.attrs.modify("NSteps", np.int64(self._frame))
-            steps["Values"].resize((self._frame,))
-            if self._leads:
-                steps["Values"][self._frame - 1] = time
-            self._file.flush()
+            self._announce(self._frame, time)
+
+    def _announce(self, n_frames: int, time: float | None = None) -> None:
+        """Let readers know of so many frames, and of the time (s) of the last."""
+        steps = self._file["VTKHDF/Steps"]
+        # Together, and before the next flush: VTK reads all times into room for NSteps of them.
+        steps.attrs.modify("NSteps", np.int64(n_frames))
+        steps["Values"].resize((n_frames,))
+        if self._leads and time is not None:
+            steps["Values"][n_frames - 1] = time
+        self._file.flush()
+
+    def sync(self) -> None:
+        """See that the frames are on the disc."""
+        with _told(self._partial):
+            _fsync(self._partial)
 
     def close(self, figures: Mapping[str, Any] | None = None) -> None:
         """End the file with rank 0's figures of the run (what JSON can hold) and give it its name."""
@@ -604,17 +769,28 @@ class ResultWriter:
         # Made alike on all ranks, as HDF5 demands of whatever makes a dataset.
         _write_json(self._file["mpitled"], name, value if self._comm is None else self._comm.bcast(dict(value)))
 
-    def _write_mesh(self) -> None:
+    def _totals(self, shares: Mapping[str, int]) -> dict[str, int]:
+        """The checksums that all ranks' shares make."""
+        rows = [list(shares.values())] if self._comm is None else self._comm.allgather(list(shares.values()))
+        return {name: checksum.total(column) for name, column in zip(shares, zip(*rows, strict=True), strict=True)}
+
+    def _count(self) -> None:
+        """Where this rank's rows are."""
         part = self._part
-        owned = part.owned
-        efg = owned & (part.nodes >= part.n_fe_nodes)
-        counts = np.array([owned.sum(), len(part.hexahedra), efg.sum(), len(part.domains)])
+        efg = part.owned & (part.nodes >= part.n_fe_nodes)
+        counts = np.array([part.owned.sum(), len(part.hexahedra), efg.sum(), len(part.domains)])
         by_rank = np.array([counts] if self._comm is None else self._comm.allgather(counts))
         totals, before = by_rank.sum(axis=0), by_rank[: part.part].sum(axis=0)
+        self._counts, self._all_counts, self._counts_before = counts, totals, before
         self._n_efg = int(counts[2])
         self._n_points, self._n_cells = int(totals[[0, 3]].sum()), int(totals[1:].sum())
         self._point_slabs = _slabs(totals[[0, 3]], before[[0, 3]], counts[[0, 3]])
         self._cell_slabs = _slabs(totals[1:], before[1:], counts[1:])
+
+    def _write_mesh(self) -> None:
+        part, counts, totals, before = self._part, self._counts, self._all_counts, self._counts_before
+        owned = part.owned
+        efg = owned & (part.nodes >= part.n_fe_nodes)
         sizes = np.array([8, 1, 1])
         corner_slabs = _slabs(sizes * totals[1:], sizes * before[1:], sizes * counts[1:])
         integration_rows = totals[0] + before[3] + np.arange(counts[3])
@@ -636,7 +812,8 @@ class ResultWriter:
         self._table(grid, "NumberOfConnectivityIds", [n_corners])
 
         def write(name: str, slabs: _Slabs, n_rows: int, values: NDArray[Any]) -> None:
-            self._write(_make(grid, name, (n_rows, *values.shape[1:]), values.dtype), slabs, values)
+            made = _make(grid, name, (n_rows, *values.shape[1:]), values.dtype)
+            self._shares[name] = self._write(made, slabs, values)
 
         points = np.concatenate([part.points[owned], part.domain_points])
         write("Points", self._point_slabs, self._n_points, points)
@@ -697,27 +874,63 @@ class ResultWriter:
     def _table(self, group: h5py.Group, name: str, values: Any) -> None:
         """A small dataset of integers that all ranks make and the first writes."""
         dataset = _make(group, name, np.shape(values), np.int64)
+        values = np.asarray(values, np.int64)
+        self._shares[dataset.name.removeprefix("/VTKHDF/")] = checksum.share(values, 0) if self._leads else 0
         if self._leads:
             dataset[...] = values
 
-    def _write(self, dataset: h5py.Dataset, slabs: _Slabs, values: NDArray[Any], first_row: int = 0) -> None:
-        """Write the rows of this rank in one collective call, which a rank without rows makes as well."""
-        shape = (sum(count for _, count in slabs), *dataset.shape[1:])
-        if values.shape != shape:
-            raise ValueError(f"{dataset.name}: {values.shape} values for rows of shape {shape}")
-        values = np.ascontiguousarray(values, dataset.dtype)
-        space, memory = dataset.id.get_space(), h5py.h5s.create_simple(shape)
-        space.select_none()
-        for start, count in slabs:
-            if count:
-                start_of_slab = (first_row + start, *(0 for _ in shape[1:]))
-                space.select_hyperslab(start_of_slab, (count, *shape[1:]), op=h5py.h5s.SELECT_OR)
-        if not values.size:
-            memory.select_none()
-        dataset.id.write(memory, space, values, dxpl=self._transfer)
+    def _write(self, dataset: h5py.Dataset, slabs: _Slabs, values: NDArray[Any], first_row: int = 0) -> int:
+        return _write_rows(dataset, slabs, values, first_row, self._transfer)
 
 
 _Slabs = list[tuple[int, int]]
+
+
+def _write_rows(
+    dataset: h5py.Dataset, slabs: _Slabs, values: NDArray[Any], first_row: int, transfer: h5py.h5p.PropDXID | None
+) -> int:
+    """Write the rows of this rank in one collective call, which a rank without rows makes as well.
+
+    Its share of the checksum of the rows from first_row on.
+    """
+    shape = (sum(count for _, count in slabs), *dataset.shape[1:])
+    if values.shape != shape:
+        raise ValueError(f"{dataset.name}: {values.shape} values for rows of shape {shape}")
+    values = np.ascontiguousarray(values, dataset.dtype)
+    space, memory = dataset.id.get_space(), h5py.h5s.create_simple(shape)
+    space.select_none()
+    entries, done, shares = int(np.prod(shape[1:])), 0, 0
+    for start, count in slabs:
+        if count:
+            start_of_slab = (first_row + start, *(0 for _ in shape[1:]))
+            space.select_hyperslab(start_of_slab, (count, *shape[1:]), op=h5py.h5s.SELECT_OR)
+        shares += checksum.share(values[done : done + count], start * entries)
+        done += count
+    if not values.size:
+        memory.select_none()
+    dataset.id.write(memory, space, values, dxpl=transfer)
+    return shares
+
+
+def _series(time: float, series: Mapping[str, float]) -> NDArray[np.float64]:
+    """The time and the numbers of a frame, as their checksum has them."""
+    return np.array([time, *(series[name] for name in sorted(series))], np.float64)
+
+
+def _collective(comm: Any) -> h5py.h5p.PropDXID | None:
+    """What makes a transfer one of all ranks."""
+    if comm is None:
+        return None
+    transfer = h5py.h5p.create(h5py.h5p.DATASET_XFER)
+    transfer.set_dxpl_mpio(h5py.h5fd.MPIO_COLLECTIVE)
+    return transfer
+
+
+def _create(path: Path, comm: Any, mode: str = "w", **options: Any) -> h5py.File:
+    """A file that all ranks write together."""
+    if comm is None:
+        return h5py.File(path, mode, locking=False, **options)
+    return h5py.File(path, mode, driver="mpio", comm=comm, **options)
 
 
 def _slabs(totals: NDArray[np.int64], before: NDArray[np.int64], counts: NDArray[np.int64]) -> _Slabs:
@@ -763,6 +976,30 @@ class Result:
     def figures(self) -> dict[str, Any]:
         """What the run ended with; empty if it was killed."""
         return _read_json(self._file["mpitled"], "figures") if "figures" in self._file["mpitled"] else {}
+
+    def check(self) -> None:
+        """Read all of the file; InputError names what does not have the checksum that it was written with."""
+        broken = _first_broken(self._file)
+        for name, total in _read_json(self._file["mpitled"], "mesh_checksums").items():
+            if _sum(self._grid[name]) != total:
+                broken = broken or name
+        times, series = self.times, self.series
+        for name in (*(f"PointData/{n}" for n in self.names("Point")), *(f"CellData/{n}" for n in self.names("Cell"))):
+            n_rows = int(self._grid[f"NumberOf{name.partition('Data')[0]}s"][0])
+            totals = self._file[f"mpitled/checksums/{name}"]
+            for frame in range(self.n_frames):
+                if _sum(self._grid[name], frame * n_rows, n_rows) != totals[frame]:
+                    broken = broken or f"{name} of frame {frame}"
+        for frame in range(self.n_frames):
+            numbers = _series(times[frame], {name: values[frame] for name, values in series.items()})
+            if checksum.total([checksum.share(numbers, 0)]) != self._file["mpitled/checksums/series"][frame]:
+                broken = broken or f"time and energies of frame {frame}"
+        if broken:
+            raise InputError(f"{self.path}: is damaged: {broken} is not what was written; run the deck again")
+
+    def names(self, kind: str) -> list[str]:
+        """What each frame holds for each "Point" or "Cell"."""
+        return list(self._file[f"mpitled/checksums/{kind}Data"])
 
     @property
     def n_frames(self) -> int:
@@ -816,6 +1053,21 @@ class Result:
         """Cell data of hexahedra and support domains, in the order of the model."""
         return self.cell_data(name, frame)[_ascending(self.cell_data("cell_id"))]
 
+    def find(self, numbers: str, wanted: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Where wanted (ascending) "node_id" or "cell_id" are: rows (ascending), and whose turn each wanted one is."""
+        kind = "Point" if numbers == "node_id" else "Cell"
+        found, rows = _matching(self._grid[f"{kind}Data/{numbers}"], wanted, 1)
+        return np.argsort(found), rows
+
+    def point_rows(self, cell_rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Rows of the integration points that are in these rows of the cells: both end with them, in the same order."""
+        return cell_rows - int(self._grid["NumberOfCells"][0]) + int(self._grid["NumberOfPoints"][0])
+
+    def rows(self, kind: str, name: str, frame: int, rows: NDArray[np.int64]) -> NDArray[Any]:
+        """Some rows (ascending) of what a frame holds for each "Point" or "Cell"."""
+        first = int(self._grid[f"Steps/{kind}DataOffsets/{name}"][frame])
+        return read_rows(self._grid[f"{kind}Data/{name}"], first + rows)
+
     def _rows(self, kind: str, name: str, frame: int) -> NDArray[Any]:
         first = int(self._grid[f"Steps/{kind}DataOffsets/{name}"][: max(1, self.n_frames)][frame])
         return self._grid[f"{kind}Data/{name}"][first : first + int(self._grid[f"NumberOf{kind}s"][0])]
@@ -825,6 +1077,17 @@ def _ascending(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
     """Rows of the numbers from 0 on, in their order; -1 is no number."""
     rows = np.flatnonzero(numbers >= 0)
     return rows[np.argsort(numbers[rows])]
+
+
+def is_unfinished(directory: Path) -> bool:
+    """Whether a directory holds results of a run that did not come to its end."""
+    return (Path(directory) / _UNFINISHED).exists()
+
+
+def is_checkpoint(path: Path) -> bool:
+    """Whether the HDF5 file is a checkpoint, of whatever layout; InputError if it is no HDF5 file."""
+    with _open(path) as file, reading(path):
+        return "told" in file and "node" in file
 
 
 def is_result(path: Path) -> bool:
@@ -852,3 +1115,96 @@ def open_result(path: Path) -> Result:
     if layout is None:
         raise InputError(f"{path}: is not a result of mpitled; give a file that 'mpitled run' wrote")
     raise InputError(f"{path}: has layout {layout}, this version reads {RESULT_LAYOUT}; run the deck again")
+
+
+# --- checkpoints -------------------------------------------------------------------------------------------------
+
+#: The last checkpoint of a run, and the one before it.
+CHECKPOINTS = ("checkpoint.h5", "checkpoint.previous.h5")
+
+
+def write_checkpoint(
+    directory: Path,
+    comm: Any,
+    part: PartRows,
+    told: Mapping[str, Any],
+    nodal: Mapping[str, NDArray[np.float64]],
+    own: Sequence[float],
+) -> None:
+    """Write a checkpoint, whole and on the disc before it takes the place of the last, which becomes the one before.
+
+    Collective. told: what JSON can hold, rank 0's; nodal: (n owned nodes, components) by name; own: numbers of this
+    rank. InputError if it cannot be written.
+    """
+    if comm is not None and comm.size == 1:
+        comm = None
+    path, previous = (Path(directory) / name for name in CHECKPOINTS)
+    new = path.with_name(f".{path.name}")
+    slabs, transfer, shares = [(part.first_row, int(part.owned.sum()))], _collective(comm), {}
+    with _told(path):
+        if part.part == 0:
+            components = sum(values.shape[1] for values in nodal.values())
+            _room(path, 8 * part.n_nodes * (1 + components) + 8 * part.n_parts * len(own) + len(str(told)))
+        # The latest format has checksums of its own for what is not data.
+        with _create(new, comm, libver="latest") as file:
+            file.attrs["layout"] = CHECKPOINT_LAYOUT
+
+            def write(name: str, n_rows: int, slabs: _Slabs, values: NDArray[Any]) -> None:
+                made = _make(file, name, (n_rows, *values.shape[1:]), values.dtype)
+                shares[name] = _write_rows(made, slabs, values, 0, transfer)
+
+            write("node", part.n_nodes, slabs, part.nodes[part.owned])
+            for name, values in nodal.items():
+                write(f"nodal/{name}", part.n_nodes, slabs, values)
+            write("own", part.n_parts, [(part.part, 1)], np.array([own], np.float64))
+            every = [shares] if comm is None else comm.allgather(shares)
+            for name in shares:
+                file[name].attrs["checksum"] = checksum.total(of_rank[name] for of_rank in every)
+            _write_json(file, "told", dict(told) if comm is None else comm.bcast(dict(told)))
+            file.flush()
+        _fsync(new)
+        if comm is not None:
+            comm.barrier()
+        if part.part == 0:
+            if path.exists():
+                os.replace(path, previous)
+            os.replace(new, path)
+            _fsync(path.parent)
+        if comm is not None:
+            comm.barrier()
+
+
+def checkpoint_contents(path: Path) -> dict[str, Any]:
+    """What a checkpoint tells. Reads all of it; InputError if it is none of this layout, or not what was written."""
+    with _open(path) as file, reading(path):
+        layout = file.attrs.get("layout") if "told" in file and "node" in file else None
+        if layout == CHECKPOINT_LAYOUT and (broken := _first_broken(file)) is None:
+            return dict(_read_json(file, "told"))
+    if layout is None:
+        raise InputError(f"{path}: is not a checkpoint of mpitled")
+    if layout != CHECKPOINT_LAYOUT:
+        raise InputError(f"{path}: has layout {layout}, this version reads {CHECKPOINT_LAYOUT}; begin anew")
+    raise InputError(f"{path}: is damaged: {broken} is not what was written")
+
+
+def read_checkpoint(path: Path, nodes: NDArray[np.int64]) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64]]:
+    """What a checkpoint holds of the nodes (ascending), (n nodes, components) by name; the numbers of each rank.
+
+    Of a file that `checkpoint_contents` has read.
+    """
+    with _open(path) as file:
+        found, rows = _matching(file["node"], nodes, 1)
+        order = np.argsort(found)
+        names: list[str] = []
+        file["nodal"].visititems(lambda name, thing: names.append(name) if isinstance(thing, h5py.Dataset) else None)
+        return {name: read_rows(file["nodal"][name], rows)[order] for name in names}, file["own"][...]
+
+
+def discard_checkpoints(directory: Path) -> bool:
+    """Remove the checkpoints of a run, if there are any: whether there were."""
+    paths = [Path(directory) / name for name in (f".{CHECKPOINTS[0]}", *CHECKPOINTS)]
+    there = [path for path in paths if path.exists()]
+    for path in there:
+        with _told(path):
+            path.unlink()
+    return bool(there)

@@ -85,3 +85,4 @@ def test_a_job_ends_in_order_before_its_time_is_up(tmp_path, script):
     assert "interrupted" in errors
     with open_result(tmp_path / "out" / "scene") as result:
         assert not result.complete
+    assert (tmp_path / "out" / "scene" / "checkpoint.h5").exists()  # the same job would go on from it

@@ -22,7 +22,9 @@ _BL = np.uint64(BATCH_LANES)
 _BLOCK = np.uint64(8)  # nodes of a support domain that are summed in registers
 # Fused multiply-adds and free association, but NaN and infinity stay what they are: the watch needs them.
 _FAST = {"contract", "nsz", "arcp", "reassoc"}
-_inline = njit(fastmath=_FAST, error_model="numpy", cache=True)
+# Forced, or the process that compiles may call another copy of the function than one that loads from the cache, with
+# other bits.
+_inline = njit(fastmath=_FAST, error_model="numpy", cache=True, forceinline=True)
 _kernel = njit(fastmath=_FAST, error_model="numpy", cache=True, nogil=True)
 
 

@@ -13,6 +13,7 @@ from mpitled.deck import Solver
 from mpitled.errors import InputError
 from mpitled.solver import kernels
 from mpitled.solver.halo import Halo, World
+from mpitled.solver.memory import Kept
 from mpitled.solver.sharpness import Sharpness
 from mpitled.solver.step import at_rest, compose_forces, compose_march, rehearse
 from mpitled.solver.subdomain import Subdomain
@@ -34,8 +35,9 @@ class March:
     runs with `mass_scaling`) or the step shorter, with the central difference for variable steps.
     """
 
-    #: What has to be put back to return to an earlier state.
-    REMEMBERED = ("state", "added_mass", "added_energy", "frame")
+    #: Beside the state: what an unstable run goes back to, and what stays as it is when it does.
+    PASSING = Kept(sums=("added_mass", "added_energy"), alike=("frame",))
+    LASTING = Kept(alike=("safety", "longest", "between"))
 
     def __init__(
         self,
@@ -61,6 +63,7 @@ class March:
         nodes, directions = np.unique(self.held // 3, return_counts=True)
         self.prescribed: NDArray[np.int64] = nodes[directions == 3].astype(np.int64)  # need no mass for stability
         self.added_mass, self.added_energy = 0.0, 0.0
+        self.longest, self.between = math.inf, 1  # found by `begin`
         self.forces, self.motion = compose_forces(sub, force_halo), compose_march(sub)
         self.sharpness = Sharpness(sub, world, self.forces, sub.free())
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mpitled.deck import Solver
 from mpitled.solver import kernels
 from mpitled.solver.halo import Halo, World
+from mpitled.solver.memory import Kept
 from mpitled.solver.sharpness import Sharpness
 from mpitled.solver.step import State, at_rest, compose_forces, compose_relaxation, rehearse
 from mpitled.solver.subdomain import Subdomain
@@ -41,8 +42,9 @@ class Relaxation:
     speed over its frequency and as its acceleration over its frequency squared, whichever is more.
     """
 
-    #: What has to be put back to return to an earlier state.
-    REMEMBERED = ("state", "u_then", "f_then", "lowest", "distance", "frame", "settled", "best", "waited")
+    #: Beside the state: what an unstable run goes back to, and what stays as it is when it does.
+    PASSING = Kept(nodes=("u_then", "f_then"), alike=("lowest", "distance", "frame", "settled", "best", "waited"))
+    LASTING = Kept(alike=("safety", "between", "load_time"))
 
     def __init__(
         self,

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled.solver.halo import World
+from mpitled.solver.memory import Kept
 from mpitled.solver.step import State, Term
 from mpitled.solver.subdomain import Subdomain
 
@@ -31,6 +32,8 @@ SELDOM, GROWS = 5, 1.05
 class Sharpness:
     """Power iteration on K = df/du in the present configuration, on all ranks; all of its calls are collective."""
 
+    LASTING = Kept(nodes=("mode",), alike=("share", "wait"))
+
     def __init__(self, sub: Subdomain, world: World, forces: tuple[Term, ...], free: NDArray[np.float64]) -> None:
         """free (3, n_nodes) is 1 at free dofs and 0 at prescribed ones."""
         self._sub, self._world, self._forces, self._free = sub, world, forces, free
@@ -38,7 +41,7 @@ class Sharpness:
         # Random numbers that belong to the nodes, whatever rank they are on.
         numbers = 3.0 * sub.rows.nodes + np.arange(3)[:, None]
         self._noise = (np.modf(np.abs(np.sin(12.9898 * (numbers + 1))) * 43758.5453)[0] - 0.5) * free
-        self._mode: NDArray[np.float64] | None = None
+        self.mode: NDArray[np.float64] | None = None  # (3, n_nodes), the last eigenvector
         self.share = 0.0  # of the bound, that the operator has had at most
         self.wait = 0  # surveys until it is looked for again
         spread = float(np.ptp(sub.rows.points, axis=0).max()) if sub.n_nodes else 0.0
@@ -67,12 +70,12 @@ class Sharpness:
 
         mobility, s^2/kg: (n_nodes,), or symmetric tensors (6, n_nodes); 0 where it does not matter.
         """
-        n, iterations = self._sub.n_nodes, FIRST if self._mode is None else AGAIN
+        n, iterations = self._sub.n_nodes, FIRST if self.mode is None else AGAIN
         trial = copy(s)
         trial.seen, trial.f = s.seen.copy(), np.zeros_like(s.f)
         self._take(trial)
         at_rest = trial.f[:, :n].astype(np.float64)
-        mode = self._noise.copy() if self._mode is None else self._mode + NOISE * self._noise
+        mode = self._noise.copy() if self.mode is None else self.mode + NOISE * self._noise
         force, found = np.zeros_like(mode), 0.0
         for iteration in range(iterations):
             size = float(self._world.gather([np.abs(mode).max(initial=0.0)]).max())
@@ -92,7 +95,7 @@ class Sharpness:
             mode, force = _times(mobility, response), response
             if iteration > 2 and found < CONVERGED * last:
                 break
-        self._mode = mode / max(size * abs(found), 1e-300)
+        self.mode = mode / max(size * abs(found), 1e-300)
         return float(RUNG ** math.ceil(math.log(found) / math.log(RUNG))) if found > 0 else 0.0
 
     def _take(self, trial: State) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +12,22 @@ from numpy.typing import NDArray
 from mpitled.loading import loading_curve
 from mpitled.solver import kernels
 from mpitled.solver.halo import Halo
+from mpitled.solver.memory import Kept
 from mpitled.solver.subdomain import Subdomain
 
 
 @dataclass(slots=True)
 class State:
     """What a step changes, on one rank."""
+
+    #: `seen` and `f` follow from u.
+    KEPT: ClassVar = Kept(
+        nodes=("u", "u_prev", "mass", "mobility"),
+        moving=("reaction",),
+        sums=("external_work", "free_work"),
+        least=("smallest_jacobian",),
+        alike=("load_time", "time_step", "time", "step", "retain", "gain"),
+    )
 
     u: NDArray[np.float64]  # (3, n_nodes + PADDING), m, at the time of `step`
     u_prev: NDArray[np.float64]  # (3, n_nodes + PADDING), m, one step before
@@ -39,7 +49,12 @@ class State:
     def place(self, u: NDArray[np.float64]) -> None:
         """Put the nodes at the displacements u (3, n_nodes), at rest."""
         self.u[:, : u.shape[1]] = self.u_prev[:, : u.shape[1]] = u
+        self.show()
+
+    def show(self) -> None:
+        """Let the cells see u after it was changed from outside, with no forces yet."""
         self.seen[:] = self.u
+        self.f[:] = 0
 
     @property
     def share(self) -> float:
@@ -99,13 +114,13 @@ def compose_forces(sub: Subdomain, halo: Halo | None) -> tuple[Term, ...]:
 
 @dataclass(frozen=True, slots=True)
 class _Motion:
-    """Where the moving dofs go next: a share of where they go at full load, or, on arcs, what a term has computed."""
+    """Where the moving dofs go next: a share of where they go at full load, which on arcs asking for it renews."""
 
     full: NDArray[np.float64]  # (n moving dofs,), m
     dofs: NDArray[np.uint32]  # (n owned moving dofs,)
     own_full: NDArray[np.float64]  # m
-    share: Callable[[State], float]  # of full and own_full
-    terms: tuple[Term, ...]  # taken before the share is asked for
+    share: Callable[[State], float]  # of full
+    own_share: Callable[[State], float]  # of own_full
 
 
 def _compose_motion(sub: Subdomain) -> _Motion:
@@ -113,15 +128,19 @@ def _compose_motion(sub: Subdomain) -> _Motion:
     full, turns = sub.moving_full, sub.moving_turns
     dofs, own_full = sub.moving[owned], full[owned]
     if turns is None:
-        return _Motion(full, dofs, own_full, lambda s: s.next_load, ())
+        return _Motion(full, dofs, own_full, lambda s: s.next_load, lambda s: s.next_load)
     ends, own_ends, own_turns = full, own_full, turns[owned]
     full, own_full = full.copy(), own_full.copy()
 
-    def follow(s: State) -> None:
+    def follow(s: State) -> float:
         kernels.follow(full, ends, turns, s.next_load)
-        kernels.follow(own_full, own_ends, own_turns, s.next_load)
+        return 1.0
 
-    return _Motion(full, dofs, own_full, lambda s: 1.0, (("motion", follow),))
+    def own_follow(s: State) -> float:
+        kernels.follow(own_full, own_ends, own_turns, s.next_load)
+        return 1.0
+
+    return _Motion(full, dofs, own_full, follow, own_follow)
 
 
 def compose_march(sub: Subdomain) -> tuple[Term, ...]:
@@ -130,14 +149,14 @@ def compose_march(sub: Subdomain) -> tuple[Term, ...]:
 
     def reactions(s: State) -> None:
         s.external_work += kernels.react(
-            s.u, s.u_prev, s.f, s.mass, m.dofs, m.own_full, m.share(s), s.reaction, s.time_step
+            s.u, s.u_prev, s.f, s.mass, m.dofs, m.own_full, m.own_share(s), s.reaction, s.time_step
         )
 
     def update(s: State) -> None:
         kernels.update(s.u, s.u_prev, s.f, s.mobility, sub.fixed, sub.moving, m.full, m.share(s), copied(s))
         advance(s)
 
-    return (*m.terms, *((("reactions", reactions),) if len(m.dofs) else ()), ("update", update))
+    return (*((("reactions", reactions),) if len(m.dofs) else ()), ("update", update))
 
 
 def compose_relaxation(sub: Subdomain, counted: NDArray[np.float64]) -> tuple[Term, ...]:
@@ -146,7 +165,7 @@ def compose_relaxation(sub: Subdomain, counted: NDArray[np.float64]) -> tuple[Te
 
     def reactions(s: State) -> None:
         s.external_work += kernels.react(
-            s.u, s.u_prev, s.f, None, m.dofs, m.own_full, m.share(s), s.reaction, s.time_step
+            s.u, s.u_prev, s.f, None, m.dofs, m.own_full, m.own_share(s), s.reaction, s.time_step
         )
 
     def relax(s: State) -> None:
@@ -156,7 +175,7 @@ def compose_relaxation(sub: Subdomain, counted: NDArray[np.float64]) -> tuple[Te
         )  # fmt: skip
         advance(s)
 
-    return (*m.terms, *((("reactions", reactions),) if len(m.dofs) else ()), ("update", relax))
+    return (*((("reactions", reactions),) if len(m.dofs) else ()), ("update", relax))
 
 
 def rehearse(s: State, terms: tuple[Term, ...]) -> None:

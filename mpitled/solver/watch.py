@@ -9,6 +9,7 @@ import numpy as np
 from mpitled.errors import UnstableError
 from mpitled.solver.halo import World
 from mpitled.solver.march import March
+from mpitled.solver.memory import Kept
 from mpitled.solver.relaxation import Relaxation
 from mpitled.solver.subdomain import Subdomain
 
@@ -24,32 +25,37 @@ _EXTREMES = {"min_jacobian": min, "step_ratio": max, "change": max, "residual": 
 class Watch:
     """The ledger of a run on one rank, and its verdict, the same on all. Its calls are collective."""
 
+    LASTING = Kept(alike=("figures", "largest_kinetic_ratio", "largest_energy"))
+
     def __init__(self, world: World, sub: Subdomain, volume: float) -> None:
         """volume: of the whole model, m^3."""
         self.world, self.sub = world, sub
         self.figures: dict[str, float] = {}  # of all ranks, at the last look
         self.own_energy = 0.0  # J, in this rank's cells
         self.largest_kinetic_ratio = 0.0
-        self.interrupted = False
-        self._largest_energy = 0.0
+        self.request = 0  # the most that any rank asked for at the last look
+        self.largest_energy = 0.0
         # The strain energy of the undeformed body is no better than this, J: tr C - 3 and ln J are not quite 0.
         self._noise = 8 * float(np.finfo(sub.precision).eps) * max(m.mu for m in sub.rows.materials) * volume
 
-    def look(self, method: March | Relaxation, interrupted: bool) -> None:
-        """Survey all ranks and keep the ledger; UnstableError, alike on all ranks, if the run cannot go on."""
+    def look(self, method: March | Relaxation, request: int) -> None:
+        """Survey all ranks and keep the ledger; UnstableError, alike on all ranks, if the run cannot go on.
+
+        request: what this rank asks of all.
+        """
         state, world = method.state, self.world
         own = method.look()
         self.own_energy = own["strain"] + own["hourglass"] + own["stabilisation"]
-        table = world.gather([*own.values(), float(interrupted)])
+        table = world.gather([*own.values(), float(request)])
         columns = dict(zip(own, table.T, strict=False))
         figures = {name: float(_EXTREMES.get(name, sum)(columns[name])) for name in own}
         internal = figures["strain"] + figures["hourglass"] + figures["stabilisation"]
         supplied = figures["external"] + figures["added"] - figures["dissipated"]
-        largest = max(self._largest_energy, abs(figures["external"]), internal, figures["kinetic"])
+        largest = max(self.largest_energy, abs(figures["external"]), internal, figures["kinetic"])
         balance = abs(supplied - internal - figures["kinetic"])
         figures["balance_error"] = balance / (largest or 1.0)
         figures["kinetic_ratio"] = figures["kinetic"] / internal if internal > 0 else 0.0
-        self.figures, self.interrupted = figures, bool(table[:, -1].any())
+        self.figures, self.request = figures, int(table[:, -1].max())
         finite = math.isfinite(internal + figures["kinetic"] + figures["external"])
         if not finite or figures["min_jacobian"] <= 0:
             reason = "a cell is turned inside out"
@@ -59,7 +65,7 @@ class Watch:
                 f"{internal:.3g} J, kinetic {figures['kinetic']:.3g} J)"
             )
         else:
-            self._largest_energy = largest
+            self.largest_energy = largest
             if state.share >= 0.1:
                 self.largest_kinetic_ratio = max(self.largest_kinetic_ratio, figures["kinetic_ratio"])
             return

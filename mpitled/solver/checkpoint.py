@@ -1,0 +1,107 @@
+"""Checkpoints: whether there is one that a run can go on from, what goes into it, and what comes out of it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mpitled import __version__, store
+from mpitled import deck as decks
+from mpitled.deck import Deck
+from mpitled.errors import InputError
+from mpitled.solver.halo import World
+from mpitled.solver.memory import Memory, Packed, Parts, pack, recall, remember, unpack
+from mpitled.solver.subdomain import Subdomain
+
+
+class Found(NamedTuple):
+    """A whole checkpoint of the run."""
+
+    path: Path
+    told: dict[str, Any]
+    damaged: str  # what is wrong with the one that it stands in for; "" if it is the last
+
+
+def marks(deck: Deck, model_key: str) -> dict[str, Any]:
+    """What tells runs from each other: a run goes on from what has the same marks."""
+    return {
+        "version": __version__,
+        "program": decks.program(),
+        "deck": json.loads(json.dumps(decks.canonical(deck, paths=False))),
+        "model": hashlib.sha256(model_key.encode()).hexdigest(),
+    }
+
+
+def find(directory: Path, deck: Deck, model_key: str) -> Found | None:
+    """The last whole checkpoint in a directory, or None; InputError if it is another run's, or none is whole."""
+    damaged: list[str] = []
+    for path in (Path(directory) / name for name in store.CHECKPOINTS):
+        if path.exists():
+            try:
+                told = store.checkpoint_contents(path)
+            except InputError as error:
+                damaged.append(str(error))
+                continue
+            if what := _other(told, deck, model_key):
+                raise InputError(f"{path}: {what}; put that back, or begin anew without --resume")
+            return Found(path, told, "; ".join(damaged))
+    if damaged:
+        raise InputError(f"{'; '.join(damaged)}; begin anew, without --resume")
+    return None
+
+
+def is_done(directory: Path, deck: Deck, model_key: str) -> bool:
+    """Whether the directory holds the result of the run, whole but for what is made of it afterwards."""
+    if store.is_unfinished(directory):
+        return False
+    try:
+        with store.open_result(directory) as result:
+            return not _other(result.metadata["marks"], deck, model_key)
+    except (InputError, KeyError):
+        return False
+
+
+def _other(told: dict[str, Any], deck: Deck, model_key: str) -> str:
+    """What of another run is told; "" if it is the same."""
+    here = marks(deck, model_key)
+    if told["program"] != here["program"]:
+        return f"was written by another program (version {told['version']}, this is {__version__})"
+    if what := decks.difference(deck, told["deck"]):
+        return f"was written for {what}"
+    return "" if told["model"] == here["model"] else "was written for another model: a file that the deck reads differs"
+
+
+def save(
+    directory: Path,
+    world: World,
+    sub: Subdomain,
+    about: dict[str, Any],
+    lasting: Parts,
+    passing: Parts,
+    states: Sequence[Memory],
+) -> None:
+    """Write a checkpoint: what lasts, as it is now, and states, the last of them the present. Collective."""
+    packed = {"lasting": pack(lasting, remember(lasting), sub)}
+    packed |= {f"state{i}": pack(passing, state, sub) for i, state in enumerate(states)}
+    nodal = {f"{name}/{key}": values for name, of in packed.items() for key, values in of.nodal.items()}
+    own = {f"{name}/{key}": value for name, of in packed.items() for key, value in of.own.items()}
+    alike = {name: of.alike for name, of in packed.items()}
+    told = about | {"own": list(own), "states": len(states), "alike": alike}
+    store.write_checkpoint(directory, world.comm, sub.rows, told, nodal, list(own.values()))
+
+
+def load(found: Found, sub: Subdomain, lasting: Parts, passing: Parts) -> list[Memory]:
+    """Put back what lasts; the states of a checkpoint, the last of them the present."""
+    nodal, table = store.read_checkpoint(found.path, sub.rows.nodes)
+    numbers = dict(zip(found.told["own"], table.T, strict=True))
+
+    def read(name: str, parts: Parts) -> Memory:
+        of = {key.removeprefix(f"{name}/"): v for key, v in nodal.items() if key.startswith(f"{name}/")}
+        own = {key.removeprefix(f"{name}/"): v for key, v in numbers.items() if key.startswith(f"{name}/")}
+        return unpack(parts, Packed(of, {}, found.told["alike"][name]), own, sub)
+
+    recall(lasting, read("lasting", lasting))
+    return [read(f"state{i}", passing) for i in range(found.told["states"])]

@@ -1,0 +1,89 @@
+"""How far a run is, how long each of its phases took, and who asks it to end."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from mpitled.errors import InterruptedRun
+from mpitled.solver.halo import World
+
+#: What ends a run in order. mpirun ends its ranks itself, within a second, when it gets one of the first two; the third
+#: it passes on.
+INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+
+_log = logging.getLogger(__name__)
+
+
+class Phases:
+    """Wall time of each phase of a run, s."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        if name not in self.seconds:
+            _log.info("%s", name)
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+
+class Interrupts:
+    """Signals that end a run in order: at its next look, or where there are no looks at once, by the first rank."""
+
+    def __init__(self, world: World) -> None:
+        self.asked, self.looked_for = False, False
+        self.when = "before the first step; nothing is lost"
+        self._leads = world.leads
+
+    def __enter__(self) -> Interrupts:
+        self._previous = {which: signal.signal(which, self._note) for which in INTERRUPTS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for which, handler in self._previous.items():
+            signal.signal(which, handler)
+
+    def _note(self, signum: int, frame: object) -> None:
+        self.asked = True
+        if self._leads and not self.looked_for:
+            raise InterruptedRun(f"interrupted {self.when}")
+
+
+class Progress:
+    """How far the run is, on stderr: a bar on a terminal, a line every tenth elsewhere."""
+
+    def __init__(self) -> None:
+        self.begin, self.tenth, self.bar = time.perf_counter(), 0, None
+        if sys.stderr.isatty():
+            try:
+                from tqdm import tqdm
+            except ImportError:
+                return
+            self.bar = tqdm(total=1.0, bar_format="{percentage:3.0f}%|{bar}| {remaining} left{postfix}")
+
+    def show(self, done: float, step: int, figures: dict[str, float]) -> None:
+        rate = step / max(time.perf_counter() - self.begin, 1e-9)
+        state = (
+            f"{rate:.0f} steps/s, kinetic/internal {figures['kinetic_ratio']:.1e}, min J {figures['min_jacobian']:.3f}"
+        )
+        if self.bar is not None:
+            self.bar.set_postfix_str(state, refresh=False)
+            self.bar.update(max(0.0, done - self.bar.n))
+        elif int(10 * done) > self.tenth:
+            self.tenth = int(10 * done)
+            left = (1 - done) / done * (time.perf_counter() - self.begin)
+            print(f"{done:4.0%}  {left:5.0f} s left  {state}", file=sys.stderr, flush=True)
+
+    def tell(self, words: str) -> None:
+        print(f"note: {words}", file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        if self.bar is not None:
+            self.bar.close()

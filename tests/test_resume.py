@@ -1,0 +1,216 @@
+"""Runs that were stopped and continued: the bits of the run that was not, and refusals of what is another run."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from conftest import ranks
+from faults import inject
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mpitled import checksum, cli, store
+from mpitled import deck as decks
+from mpitled.deck import load_deck
+from mpitled.errors import InputError, InterruptedRun
+from mpitled.solver import run as runs
+from mpitled.solver.halo import World
+
+BLOCK = """
+[block]
+size = [30.0, 24.0, 24.0]
+elements = [10, 8, 8]
+cloud = "core"
+[cloud]
+points_per_spacing = 1.4
+[material.brain]
+youngs_modulus = 3000.0
+poissons_ratio = 0.49
+[[fixed]]
+nodes = "x0"
+[[displaced]]
+nodes = "x1"
+displacement = [{millimetres}, 0.0, 0.0]
+rotation = {degrees}
+axis = "x"
+centre = [0.0, 12.0, 12.0]
+[solver]
+load_time = 0.2
+{solver}
+[output]
+frames = 3
+pictures = false
+"""
+#: What is not of the scene but of the machine, or of having been stopped.
+OF_THE_MACHINE = {"seconds", "term_seconds", "cell_updates_per_second", "halo_share", "imbalance", "peak_memory_bytes"}
+
+
+def run(deck: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, stop_at: int = 0, resume: bool = False) -> Any:
+    """The report; or stop at a look, as a signal does, and give the number of looks that there were."""
+    looks, look = 0, runs._Run._look
+
+    def counted(this: runs._Run) -> None:
+        nonlocal looks
+        looks += 1
+        this.interrupts.asked = looks == stop_at
+        look(this)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(runs._Run, "_look", counted)
+        try:
+            report = runs.run(load_deck(deck), folder, World(), quiet=True, resume=resume)
+        except InterruptedRun:
+            return looks
+    report["looks"] = looks
+    return report
+
+
+def held(folder: Path) -> tuple[list[bytes], dict[str, Any]]:
+    """All that a whole result holds of its frames, and its figures."""
+    with store.open_result(folder) as result:
+        assert result.complete
+        result.check()
+        arrays = [result.times, *result.series.values()]
+        for k in range(result.n_frames):
+            arrays += [result.at_nodes("displacement", k), result.at_nodes("field_displacement", k)]
+            arrays += [result.at_integration_points("displacement", k), result.in_cells("J", k)]
+        figures = {k: v for k, v in result.figures.items() if k not in OF_THE_MACHINE | {"resumed_at_step"}}
+    return [array.tobytes() for array in arrays], figures
+
+
+@pytest.mark.parametrize(("solver", "millimetres", "degrees"), [
+    ("", 4.0, 0.0),  # and on to the distance of its end from the static solution
+    ('method = "dynamic"\nhold_time = 0.05', 4.0, 30.0),
+    ('method = "dynamic-relaxation"\nprecision = "single"\ntolerance = 0.05', 4.0, 30.0),
+    ('method = "dynamic-relaxation"\nload_steps = 20\non_inversion = "recover"', 14.0, 0.0),
+])  # fmt: skip
+def test_a_run_goes_on_to_the_same_bits(tmp_path, monkeypatch, solver, millimetres, degrees):
+    """Stopped three times: early, in the middle and late."""
+    deck = tmp_path / "scene.toml"
+    deck.write_text(BLOCK.format(solver=solver, millimetres=millimetres, degrees=degrees))
+    whole = run(deck, tmp_path / "whole", monkeypatch)
+    if "recover" in solver:
+        assert whole["recoveries"] > 0
+    looks = [run(deck, tmp_path / "part", monkeypatch, 2)]
+    for share in (0.4, 0.55):
+        looks.append(run(deck, tmp_path / "part", monkeypatch, int(share * whole["looks"]), resume=True))
+    assert isinstance(looks[-1], int), "was not stopped"
+    report = run(deck, tmp_path / "part", monkeypatch, resume=True)
+    assert report["resumed_at_step"] > 0
+    assert held(tmp_path / "part") == held(tmp_path / "whole")
+    same = {name for name in report if name not in OF_THE_MACHINE | {"resumed_at_step", "looks"}}
+    assert {name: report[name] for name in same} == {name: whole[name] for name in same}
+    assert not any((tmp_path / "part" / name).exists() for name in store.CHECKPOINTS)
+    again = run(deck, tmp_path / "part", monkeypatch, resume=True)  # only the report is made
+    assert again["looks"] == 0
+
+
+@pytest.fixture
+def stopped(tmp_path, monkeypatch) -> tuple[Path, Path]:
+    """A deck and the folder of a run of it that was stopped twice: it has two checkpoints."""
+    deck, folder = tmp_path / "scene.toml", tmp_path / "out"
+    deck.write_text(BLOCK.format(solver="", millimetres=1.0, degrees=0.0))
+    run(deck, folder, monkeypatch, 3)
+    run(deck, folder, monkeypatch, 3, resume=True)
+    return deck, folder
+
+
+def test_another_run_is_refused(stopped, monkeypatch):
+    deck, folder = stopped
+    go_on = lambda *keys: runs.run(load_deck(deck, keys), folder, World(), quiet=True, resume=True)  # noqa: E731
+    with pytest.raises(
+        InputError, match=r"checkpoint\.h5: was written for solver\.load_time = 0\.2, and not 0\.3; put"
+    ):
+        go_on("solver.load_time=0.3")
+    with pytest.raises(InputError, match=r"material\.brain\.density"):
+        go_on("material.brain.density=1001")
+    with monkeypatch.context() as patch:
+        patch.setattr(decks, "program", lambda: "another")
+        with pytest.raises(InputError, match="another program"):
+            go_on()
+    assert go_on("title=renamed", "output.checkpoint_minutes=1")["complete"]
+
+
+def test_a_damaged_checkpoint_is_named_and_the_one_before_it_used(stopped, monkeypatch, capsys):
+    deck, folder = stopped
+    last, before = (folder / name for name in store.CHECKPOINTS)
+    steps = [store.checkpoint_contents(path)["step"] for path in (before, last)]
+    assert steps[0] < steps[1]
+    rng = np.random.default_rng(0)
+    whole = last.read_bytes()
+    for harm in (lambda data: data[: len(data) // 2], lambda data: b"", flipped(rng), flipped(rng), flipped(rng)):
+        last.write_bytes(harm(whole))
+        with pytest.raises(InputError, match=str(last)):
+            store.checkpoint_contents(last)
+    assert run(deck, folder, monkeypatch, resume=True)["resumed_at_step"] == steps[0]
+    assert str(last) in capsys.readouterr().err
+    before.write_bytes(b"no checkpoint")
+    last.write_bytes(whole[:1000])
+    (folder / "result.vtkhdf").unlink()
+    with pytest.raises(InputError, match="begin anew"):
+        run(deck, folder, monkeypatch, resume=True)
+
+
+def flipped(rng: np.random.Generator) -> Any:
+    def harm(data: bytes) -> bytes:
+        changed = bytearray(data)
+        # In the numbers, which are nearly all of the file.
+        changed[int(rng.integers(len(data) // 2, 3 * len(data) // 4))] ^= 1 << int(rng.integers(8))
+        return bytes(changed)
+
+    return harm
+
+
+def test_info_names_what_is_damaged(stopped, monkeypatch, capsys):
+    deck, folder = stopped
+    run(deck, folder, monkeypatch, resume=True)
+    rng = np.random.default_rng(1)
+    for name in ("model.h5", "result.vtkhdf"):
+        path = folder / name
+        for harm, status in ((lambda data: data, 0), (flipped(rng), 2), (lambda data: data[:-5000], 2)):
+            whole = path.read_bytes()
+            path.write_bytes(harm(whole))
+            with pytest.raises(SystemExit) as end:
+                cli.main(["info", str(path)])
+            path.write_bytes(whole)
+            assert end.value.code == status
+            said = capsys.readouterr()
+            assert ("whole" in said.out) == (status == 0)
+            assert status == 0 or str(path) in said.err
+
+
+def test_a_damaged_model_is_built_anew(stopped, monkeypatch, capsys):
+    deck, folder = stopped
+    path = folder / "model.h5"
+    whole = path.read_bytes()
+    with h5py.File(path, "r+") as file:
+        file["domain_gradients"][3, 2, 1] *= 1 + 1e-12
+    run(deck, folder, monkeypatch, resume=True)
+    assert "it is built anew" in capsys.readouterr().err
+    assert path.read_bytes() == whole
+
+
+@given(st.binary(min_size=8, max_size=400), st.integers(0, 50), st.integers(0, 7), st.data())
+def test_shares_of_a_checksum_add_up_and_any_change_of_a_word_shows(data, cut, bit, draw):
+    words = np.frombuffer(data[: len(data) // 8 * 8], np.float64)
+    cut = min(cut, len(words))
+    whole = checksum.total([checksum.share(words, 0)])
+    assert checksum.total([checksum.share(words[cut:], cut), checksum.share(words[:cut], 0)]) == whole
+    place = draw.draw(st.integers(0, len(words) - 1))
+    changed = bytearray(words.tobytes())
+    changed[8 * place + bit] ^= 1 << bit
+    assert checksum.total([checksum.share(np.frombuffer(bytes(changed), np.float64), 0)]) != whole
+
+
+def test_a_few_faults_are_survived(tmp_path):
+    """A short cut of `python tests/faults.py`."""
+    if sys.platform != "linux":
+        pytest.skip("kills by what /proc says")
+    ranks(2)
+    made = inject(tmp_path, 3)
+    assert made.all_survived, made.table()
