@@ -133,11 +133,20 @@ def forces(sub, state):
 
 SCENES = {
     "voxels": lambda: part(*box()[:2], *no_domains(), box()[2]),
+    "voxels along y": lambda: turned(1),
+    "voxels along z": lambda: turned(2),
     "distorted": lambda: part(*box(distortion=0.15)[:2], *no_domains(), box()[2]),
     "voxels and distorted": lambda: mixed_shapes(),
     "domains": lambda: all_domains(8),
     "domains of 13 nodes": lambda: all_domains(13),
 }
+
+
+def turned(axis):
+    """Bricks whose nodes follow each other along another axis than x."""
+    points, cells, material = box()
+    order = [CORNERS.tolist().index(np.roll(corner, -axis).tolist()) for corner in CORNERS]
+    return part(np.roll(points * [1.0, 0.7, 1.5], axis, axis=1), cells[:, order], *no_domains(), material)
 
 
 def mixed_shapes():

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mpitled.material import hourglass_modulus
 from mpitled.mesh import CORNERS
 from mpitled.solver import hexahedra, support
-from mpitled.solver.kernels import BATCH_LANES, VOXEL_LANES
+from mpitled.solver.kernels import BATCH_LANES
 from mpitled.store import PartRows
 
 #: Boxes in a row shorter than this are gathered: a run keeps a whole vector of lanes busy.
@@ -19,13 +19,21 @@ SHORTEST_RUN = 4
 #: Edges of a box agree this well relative to their length: the round-off of coordinates far from the origin.
 BOX_TOLERANCE = 1e-11
 
+# Corners on the four lines along each axis, (3, 4, 2): near and far. Lines and axes are in turn from that axis.
+_NUMBER = {tuple(corner): number for number, corner in enumerate(CORNERS.tolist())}
+_LINES: NDArray[np.int64] = np.array([
+    [[_NUMBER[tuple(np.roll((end, s, t), axis).tolist())] for end in (-1, 1)] for t in (-1, 1) for s in (-1, 1)]
+    for axis in range(3)
+])  # fmt: skip
+
 
 @dataclass(frozen=True, slots=True)
 class VoxelRuns:
     """Equal boxes whose nodes follow each other along a grid line; arguments of `kernels.voxel_forces`."""
 
-    start: NDArray[np.uint64]  # (8, n_runs)
-    length: NDArray[np.uint64]  # (n_runs,), at most VOXEL_LANES
+    line: NDArray[np.uint64]  # (4, n_runs)
+    length: NDArray[np.uint64]  # (n_runs,)
+    along: NDArray[np.uint64]  # (n_runs,)
     first_cell: NDArray[np.uint64]  # (n_runs,)
     scale: NDArray[np.floating]  # (3, n_runs), 1/m
     coefficient: NDArray[np.floating]  # (3, n_runs)
@@ -132,8 +140,9 @@ def localise(
     lame = np.stack([mu, lam])
     cells = local(rows.hexahedra)
     box, edges = _boxes(rows.points, cells)
-    breaks = _run_breaks(cells, box, edges, rows.material[:n_hexahedra])
-    in_runs = np.repeat(np.diff(breaks) >= SHORTEST_RUN, np.diff(breaks)) & box
+    along = _along(cells)
+    breaks = _run_breaks(cells, box & (along >= 0), edges, rows.material[:n_hexahedra])
+    in_runs = np.repeat(np.diff(breaks) >= SHORTEST_RUN, np.diff(breaks)) & box & (along >= 0)
     general = np.flatnonzero(~in_runs)
     dofs = 3 * local(rows.prescribed_dofs // 3) + (rows.prescribed_dofs % 3).astype(np.uint32)
     turns = rows.prescribed_turns.any(axis=1)
@@ -142,7 +151,7 @@ def localise(
         rows=rows,
         n_nodes=len(rows.nodes),
         n_cells=len(rows.cells),
-        runs=_in(precision, _voxel_runs(cells, edges, lame[:, :n_hexahedra], breaks, in_runs, hourglass)),
+        runs=_in(precision, _voxel_runs(cells, along, edges, lame[:, :n_hexahedra], breaks, in_runs, hourglass)),
         hexahedra=_in(
             precision, _hexahedron_batches(rows.points, cells, general, lame, len(rows.cells), hourglass, rule)
         ),
@@ -185,23 +194,30 @@ def _boxes(points: NDArray[np.float64], cells: NDArray[np.uint32]) -> tuple[NDAr
     return box, edges
 
 
+def _along(cells: NDArray[np.uint32]) -> NDArray[np.int8]:
+    """The axis along which each hexahedron's far nodes follow the near ones by number, or -1."""
+    along = np.full(len(cells), -1, np.int8)
+    for axis, lines in enumerate(_LINES):
+        along[(cells[:, lines[:, 1]].astype(np.int64) - cells[:, lines[:, 0]] == 1).all(axis=1)] = axis
+    return along
+
+
 def _run_breaks(
     cells: NDArray[np.uint32], box: NDArray[np.bool_], edges: NDArray[np.float64], material: NDArray[np.int16]
 ) -> NDArray[np.int64]:
-    """First cells of rows of at most VOXEL_LANES equal boxes with nodes in a row, and the number of cells."""
+    """First cells of rows of equal boxes with nodes in a row, and the number of cells."""
     n = len(cells)
     if n == 0:
         return np.zeros(1, np.int64)
     follows = (cells[1:].astype(np.int64) - cells[:-1] == 1).all(axis=1) & box[1:] & box[:-1]
     follows &= material[1:] == material[:-1]
     follows &= (np.abs(edges[1:] - edges[:-1]) <= BOX_TOLERANCE * edges[1:]).all(axis=1)
-    first = np.concatenate([[0], np.flatnonzero(~follows) + 1])
-    place = np.arange(n) - np.repeat(first, np.diff(np.append(first, n)))
-    return np.append(np.flatnonzero(place % VOXEL_LANES == 0), n)
+    return np.concatenate([[0], np.flatnonzero(~follows) + 1, [n]])
 
 
 def _voxel_runs(
     cells: NDArray[np.uint32],
+    along: NDArray[np.int8],
     edges: NDArray[np.float64],
     lame: NDArray[np.float64],
     breaks: NDArray[np.int64],
@@ -211,13 +227,16 @@ def _voxel_runs(
     if not in_runs.any():
         return None
     first = breaks[:-1][in_runs[breaks[:-1]]]
-    edge = edges[first].T
+    axis = along[first].astype(np.int64)
+    # Axes in turn from that of the run.
+    edge = np.take_along_axis(edges[first], (axis[:, None] + np.arange(3)) % 3, axis=1).T
     volume = edge.prod(axis=0)
     gram = 1 / (2 * edge**2)
     mu, lam = lame[:, first]
     return VoxelRuns(
-        start=np.ascontiguousarray(cells[first].T, dtype=np.uint64),
+        line=np.ascontiguousarray(np.take_along_axis(cells[first], _LINES[axis, :, 0], axis=1).T, dtype=np.uint64),
         length=np.diff(breaks)[in_runs[breaks[:-1]]].astype(np.uint64),
+        along=axis.astype(np.uint64),
         first_cell=first.astype(np.uint64),
         scale=1 / (4 * edge),
         coefficient=np.stack(
