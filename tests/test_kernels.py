@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from mpitled.material import Material, first_piola, strain_energy
 from mpitled.mesh import CORNERS, grid_points, structured_hexahedra
 from mpitled.solver import hexahedra, kernels
 from mpitled.solver.step import State, at_rest, compose_forces, compose_march
-from mpitled.solver.subdomain import localise
+from mpitled.solver.subdomain import DOMAIN_NODE_COST, GATHERED_COST, cell_costs, localise
 from mpitled.solver.survey import Survey
 from mpitled.store import PartRows
 
@@ -180,6 +181,17 @@ def test_forces_energies_and_jacobians_are_those_of_the_plain_formulas(scene, st
     assert seen.jacobian[:-1] == pytest.approx(J, rel=1e-13)
     assert figures["strain"] == pytest.approx(strain, rel=1e-10)  # W is a small difference of (J - 1) and ln J
     assert figures["hourglass"] + figures["stabilisation"] == pytest.approx(resisted, rel=1e-12)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_cells_cost_by_what_computes_them(scene):
+    rows = SCENES[scene]()
+    sub = localise(replace(rows, material=0 * rows.material), HOURGLASS, 0.1, "mean")
+    costs = cell_costs(rows.points, rows.hexahedra, rows.domains)
+    in_runs = int(sub.runs.length.sum()) if sub.runs else 0
+    of_domain = DOMAIN_NODE_COST * rows.domains.shape[1]
+    expected = [1.0] * in_runs + [GATHERED_COST] * (len(rows.hexahedra) - in_runs) + [of_domain] * len(rows.domains)
+    assert sorted(costs) == sorted(expected)
 
 
 @pytest.mark.parametrize("scene", SCENES)

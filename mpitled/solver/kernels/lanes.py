@@ -171,8 +171,9 @@ for _function, _instruction in (
 
 def _of(row: types.Type) -> Lanes | None:
     """The vectors that an array without gaps is made of."""
-    numbers = isinstance(row, types.Array) and isinstance(row.dtype, types.Float) and row.layout == "C"
-    return Lanes(row.dtype) if numbers else None
+    if isinstance(row, types.Array) and isinstance(row.dtype, types.Float) and row.layout == "C":
+        return Lanes(row.dtype)
+    return None
 
 
 _typed(width, lambda row: types.uint64 if _of(row) else None)
