@@ -183,6 +183,21 @@ def test_forces_energies_and_jacobians_are_those_of_the_plain_formulas(scene, st
     assert figures["hourglass"] + figures["stabilisation"] == pytest.approx(resisted, rel=1e-12)
 
 
+def test_nodes_behind_a_run_are_no_cell():
+    """Stretched by an edge, a line's last node and the next line's first would be a cell of no volume."""
+    edge = 2.0**-9
+    points, cells, _ = box((6, 3, 2), edge)
+    rows = part(points, cells, *no_domains(), np.zeros(len(cells), np.int64))
+    u = points * [1 / 6, 0.0, 0.0]
+    sub = localise(rows, HOURGLASS, 0.0, "mean")
+    assert sub.runs is not None
+    state = at(sub, u)
+    found = forces(sub, state)
+    expected = plain(rows, u, 0.0)[0]
+    assert np.abs(found - expected).max() < 1e-13 * np.abs(expected).max()
+    assert state.smallest_jacobian == 1.0  # that of rest: no cell is compressed
+
+
 @pytest.mark.parametrize("scene", SCENES)
 def test_cells_cost_by_what_computes_them(scene):
     rows = SCENES[scene]()

@@ -122,7 +122,7 @@ def domain_forces(u, f, nodes, gradient, position, inverse, coefficient):  # typ
             grad, ax, ay, az = _domain_modes(u, at, b, X, inner, w, ue)
             mu = load(coefficient[batch, 0], w)
             lam = load(coefficient[batch, 1], w)
-            p = first_piola(grad, mu, lam, one)
+            p = first_piola(grad, mu, lam, one, None)
             least = smaller(least, p[9])
             for a in range(n):
                 i = U(3) * a

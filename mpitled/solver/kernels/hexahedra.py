@@ -117,8 +117,8 @@ def voxel_forces(u, f, line, length, along, scale, coefficient):  # type: ignore
     coefficient (3, n_runs), J: mu V, lambda V, and in N/m the hourglass stiffness k of eq. 4.22
     (R (lambda + 2 mu) V (B:B) / 8).
 
-    On a box gamma^T u = H^T u, for x^T H = 0 (eq. 4.20). The last vector of a run has lanes without a cell, which add
-    nothing to the nodes that come behind.
+    On a box gamma^T u = H^T u, for x^T H = 0 (eq. 4.20). The last vector of a run has lanes without a cell, whose nodes
+    are those that come behind: they have no stiffness, and add nothing there.
     """
     one = u.dtype.type(1)
     zeros = spread(u.dtype.type(0), u[0])
@@ -144,12 +144,11 @@ def voxel_forces(u, f, line, length, along, scale, coefficient):  # type: ignore
             i2 = line[2, run] + w
             i3 = line[3, run] + w
             mu = first_of(n - w, spread(coefficient[0, run], u[0]), zeros)
-            lam = first_of(n - w, spread(coefficient[1, run], u[0]), zeros)
             k = first_of(n - w, spread(coefficient[2, run], u[0]), zeros)
             mx = _box_modes(u[x], i0, i1, i2, i3)
             my = _box_modes(u[y], i0, i1, i2, i3)
             mz = _box_modes(u[z], i0, i1, i2, i3)
-            p = first_piola(_box_gradient(mx, my, mz, g0, g1, g2), mu, lam, one)
+            p = first_piola(_box_gradient(mx, my, mz, g0, g1, g2), mu, coefficient[1, run], one, n - w)
             least = smaller(least, first_of(n - w, p[9], ones))
             bx = _add_box_forces(f[x], i0, i1, i2, i3, p[0] * g0, p[1] * g1, p[2] * g2, mx, k, bx)
             by = _add_box_forces(f[y], i0, i1, i2, i3, p[3] * g0, p[4] * g1, p[5] * g2, my, k, by)
@@ -309,7 +308,7 @@ def hexahedron_forces(u, f, nodes, geometry, coefficient):  # type: ignore[no-un
             mu = load(coefficient[batch, 0], w)
             lam = load(coefficient[batch, 1], w)
             k = load(coefficient[batch, 2], w)
-            p = first_piola(mx[:3] + my[:3] + mz[:3], mu, lam, one)
+            p = first_piola(mx[:3] + my[:3] + mz[:3], mu, lam, one, None)
             least = smaller(least, p[9])
             _add_hexahedron_forces(f[0], at, g, w, p[0], p[1], p[2], mx, k)
             _add_hexahedron_forces(f[1], at, g, w, p[3], p[4], p[5], my, k)

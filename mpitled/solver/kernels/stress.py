@@ -6,7 +6,7 @@ from typing import Any
 
 from numba import njit
 
-from mpitled.solver.kernels.lanes import FAST, load, magnitude, root, store
+from mpitled.solver.kernels.lanes import FAST, first_of, load, magnitude, root, store
 
 #: Decorators of what kernels call, and of kernels.
 inline: Any = njit(fastmath=FAST, error_model="numpy", cache=True, forceinline=True)
@@ -29,14 +29,19 @@ def cofactor(a, b, c, d, e, f, g, h, i):  # type: ignore[no-untyped-def]
 
 
 @inline
-def first_piola(grad, mu, lam, one):  # type: ignore[no-untyped-def]
-    """P = mu X + (lambda (J - 1) - mu / J) K (design of `material.first_piola`), and J, from grad u."""
+def first_piola(grad, mu, lam, one, n):  # type: ignore[no-untyped-def]
+    """P = mu X + (lambda (J - 1) - mu / J) K (design of `material.first_piola`), and J, from grad u.
+
+    Where n is given, only the first n lanes are cells; in the others mu is 0 and so is P, for any J, also for none.
+    """
     a, b, c, d, e, f, g, h, i = grad
     a = a + one
     e = e + one
     i = i + one
     k0, k1, k2, k3, k4, k5, k6, k7, k8, J = cofactor(a, b, c, d, e, f, g, h, i)
     q = lam * (J - one) - mu / J
+    if n is not None:
+        q = first_of(n, q, mu)
     return (
         mu * a + q * k0, mu * b + q * k1, mu * c + q * k2,
         mu * d + q * k3, mu * e + q * k4, mu * f + q * k5,
