@@ -136,6 +136,7 @@ SCENES = {
     "voxels": lambda: part(*box()[:2], *no_domains(), box()[2]),
     "voxels along y": lambda: turned(1),
     "voxels along z": lambda: turned(2),
+    "distorted along z": lambda: turned(2, 0.15),
     "distorted": lambda: part(*box(distortion=0.15)[:2], *no_domains(), box()[2]),
     "voxels and distorted": lambda: mixed_shapes(),
     "domains": lambda: all_domains(8),
@@ -143,9 +144,9 @@ SCENES = {
 }
 
 
-def turned(axis):
+def turned(axis, distortion=0.0):
     """Bricks whose nodes follow each other along another axis than x."""
-    points, cells, material = box()
+    points, cells, material = box(distortion=distortion)
     order = [CORNERS.tolist().index(np.roll(corner, -axis).tolist()) for corner in CORNERS]
     return part(np.roll(points * [1.0, 0.7, 1.5], axis, axis=1), cells[:, order], *no_domains(), material)
 

@@ -79,7 +79,9 @@ def compose_forces(sub: Subdomain, halo: Halo | None) -> tuple[Term, ...]:
     if hexahedra is not None:
 
         def general(s: State) -> None:
-            J = kernels.hexahedron_forces(s.seen, s.f, hexahedra.nodes, hexahedra.geometry, hexahedra.coefficient)
+            J = kernels.hexahedron_forces(
+                s.seen, s.f, hexahedra.nodes, hexahedra.in_row, hexahedra.geometry, hexahedra.coefficient
+            )
             s.smallest_jacobian = min(s.smallest_jacobian, J)
 
         terms.append(("hexahedra", general))

@@ -12,6 +12,7 @@ from mpitled.material import hourglass_modulus
 from mpitled.mesh import CORNERS
 from mpitled.solver import hexahedra, support
 from mpitled.solver.kernels import BATCH_LANES
+from mpitled.solver.kernels.lanes import BITS
 from mpitled.store import PartRows
 
 #: Boxes in a row shorter than this are gathered: a run keeps a whole vector of lanes busy.
@@ -49,6 +50,7 @@ class HexahedronBatches:
     """Hexahedra of any shape in lanes; arguments of `kernels.hexahedron_forces`."""
 
     nodes: NDArray[np.uint32]  # (n_batches, 8, lanes)
+    in_row: NDArray[np.bool_]  # (n_batches, vectors in a batch)
     cells: NDArray[np.uint32]  # (n_batches, lanes)
     geometry: NDArray[np.floating]  # (n_batches, 30, lanes)
     coefficient: NDArray[np.floating]  # (n_batches, 3, lanes)
@@ -157,7 +159,8 @@ def localise(
         n_cells=len(rows.cells),
         runs=_in(precision, _voxel_runs(cells, along, edges, lame[:, :n_hexahedra], breaks, in_runs, hourglass)),
         hexahedra=_in(
-            precision, _hexahedron_batches(rows.points, cells, general, lame, len(rows.cells), hourglass, rule)
+            precision,
+            _hexahedron_batches(rows.points, cells, general, lame, len(rows.cells), hourglass, rule, precision),
         ),
         domains=_in(precision, _domain_batches(rows, local(rows.domains), lame[:, n_hexahedra:], stabilisation)),
         fixed=dofs[~moves],
@@ -269,24 +272,45 @@ def _hexahedron_batches(
     n_cells: int,
     hourglass: float,
     rule: str,
+    precision: type[np.floating],
 ) -> HexahedronBatches | None:
     if len(chosen) == 0:
         return None
-    nodes = cells[chosen]
+    nodes = _turned(cells[chosen])
     gradient_modes, x_modes, volumes = hexahedra.hadamard(points, nodes, rule)
     gradients, _ = hexahedra.geometry(points, nodes, rule)
     gamma = hexahedra.hourglass_vectors(points, nodes, gradients)
     mu, lam = lame[:, chosen]
     k = hexahedra.hourglass_stiffness(gradients, volumes, hourglass_modulus(lam, mu), hourglass)
     geometry = np.concatenate([gradient_modes.reshape(-1, 18) / 8, x_modes.reshape(-1, 12)], axis=1)
+    lanes = _lanes(nodes)
     return HexahedronBatches(
-        nodes=_lanes(nodes),
+        nodes=lanes,
+        in_row=_in_row(lanes, BITS // 8 // precision().itemsize),
         cells=_lanes(chosen[:, None].astype(np.uint32), n_cells)[:, 0],
         geometry=_lanes(geometry),
         coefficient=_lanes(np.stack([mu * volumes, lam * volumes, k], axis=1), 0),
         gram=_lanes(_symmetric(np.einsum("eai,eaj->eij", gradients, gradients))),
         stiffness=_lanes((k * np.linalg.eigvalsh(np.einsum("eam,ean->emn", gamma, gamma))[:, -1])[:, None], 0)[:, 0],
     )
+
+
+def _turned(nodes: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """Hexahedra (n, 8) whose far nodes follow the near ones along some axis, turned so that it is their first."""
+    along = _along(nodes)
+    order = np.empty((3, 8), np.int64)
+    order[:, [[0, 1], [3, 2], [4, 5], [7, 6]]] = _LINES
+    return np.take_along_axis(nodes, order[np.maximum(along, 0)], axis=1)
+
+
+def _in_row(nodes: NDArray[np.uint32], width: int) -> NDArray[np.bool_]:
+    """In which vectors of so many lanes each corner's nodes follow each other, and the far ones the near ones.
+
+    nodes (n_batches, 8, lanes) -> (n_batches, vectors in a batch).
+    """
+    vectors = nodes.reshape(*nodes.shape[:2], -1, width).astype(np.int64)
+    far = vectors[:, [1, 2, 5, 6]] - vectors[:, [0, 3, 4, 7]]
+    return np.asarray((np.diff(vectors, axis=3) == 1).all(axis=(1, 3)) & (far == 1).all(axis=(1, 3)))
 
 
 def _domain_batches(

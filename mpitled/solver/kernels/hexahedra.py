@@ -226,15 +226,55 @@ def _squares(qx, qy, qz):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _hexahedron_modes(uc, nodes, g, w):  # type: ignore[no-untyped-def]
+def _corner_values(uc, nodes, w, in_row):  # type: ignore[no-untyped-def]
+    """A component at the corners of some lanes of a batch. in_row: None, or each corner's nodes follow each other."""
+    if in_row is not None:
+        return (
+            load(uc, U(nodes[0, w])), load(uc, U(nodes[1, w])), load(uc, U(nodes[2, w])), load(uc, U(nodes[3, w])),
+            load(uc, U(nodes[4, w])), load(uc, U(nodes[5, w])), load(uc, U(nodes[6, w])), load(uc, U(nodes[7, w])),
+        )  # fmt: skip
+    return (
+        gather(uc, nodes[0], w), gather(uc, nodes[1], w), gather(uc, nodes[2], w), gather(uc, nodes[3], w),
+        gather(uc, nodes[4], w), gather(uc, nodes[5], w), gather(uc, nodes[6], w), gather(uc, nodes[7], w),
+    )  # fmt: skip
+
+
+@inline
+def _add_row(fc, node, near, far):  # type: ignore[no-untyped-def]
+    """Add forces to the nodes of a row: the near ones of its cells, and the far ones, each the near one of the next."""
+    first = U(node)
+    none = spread(fc.dtype.type(0), fc)
+    store(fc, first, load(fc, first) + (near + shift(none, far)))
+    fc[first + width(fc)] += last(far)
+
+
+@inline
+def _add_corner_values(fc, nodes, w, in_row, c):  # type: ignore[no-untyped-def]
+    """The transpose of `_corner_values`: add c to them."""
+    if in_row is not None:
+        _add_row(fc, nodes[0, w], c[0], c[1])
+        _add_row(fc, nodes[3, w], c[3], c[2])
+        _add_row(fc, nodes[4, w], c[4], c[5])
+        _add_row(fc, nodes[7, w], c[7], c[6])
+    else:
+        scatter(fc, nodes[0], w, c[0])
+        scatter(fc, nodes[1], w, c[1])
+        scatter(fc, nodes[2], w, c[2])
+        scatter(fc, nodes[3], w, c[3])
+        scatter(fc, nodes[4], w, c[4])
+        scatter(fc, nodes[5], w, c[5])
+        scatter(fc, nodes[6], w, c[6])
+        scatter(fc, nodes[7], w, c[7])
+
+
+@inline
+def _hexahedron_modes(uc, nodes, g, w, in_row):  # type: ignore[no-untyped-def]
     """grad u in one direction, with the mean gradient, and gamma^T u = H^T u - (x^T H)^T grad u (eq. 4.21) behind it.
 
     nodes (8, lanes) and g (30, lanes) of a batch, see `hexahedron_forces`; w: the first of its lanes.
     """
-    r, s, t, rs, st, rt, rst = _modes(
-        gather(uc, nodes[0], w), gather(uc, nodes[1], w), gather(uc, nodes[2], w), gather(uc, nodes[3], w),
-        gather(uc, nodes[4], w), gather(uc, nodes[5], w), gather(uc, nodes[6], w), gather(uc, nodes[7], w),
-    )  # fmt: skip
+    v = _corner_values(uc, nodes, w, in_row)
+    r, s, t, rs, st, rt, rst = _modes(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7])
     x = (
         (r * load(g[0], w) + s * load(g[3], w) + t * load(g[6], w))
         + (rs * load(g[9], w) + st * load(g[12], w) + rt * load(g[15], w))
@@ -257,7 +297,7 @@ def _hexahedron_modes(uc, nodes, g, w):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _add_hexahedron_forces(fc, nodes, g, w, px, py, pz, modes, k):  # type: ignore[no-untyped-def]
+def _add_hexahedron_forces(fc, nodes, g, w, in_row, px, py, pz, modes, k):  # type: ignore[no-untyped-def]
     """Add the forces in one direction: of a row of P, and of the modes of u."""
     rs = k * modes[3]
     st = k * modes[4]
@@ -276,23 +316,34 @@ def _add_hexahedron_forces(fc, nodes, g, w, px, py, pz, modes, k):  # type: igno
         rt + (px * load(g[15], w) + py * load(g[16], w) + pz * load(g[17], w)),
         rst,
     )
-    scatter(fc, nodes[0], w, c[0])
-    scatter(fc, nodes[1], w, c[1])
-    scatter(fc, nodes[2], w, c[2])
-    scatter(fc, nodes[3], w, c[3])
-    scatter(fc, nodes[4], w, c[4])
-    scatter(fc, nodes[5], w, c[5])
-    scatter(fc, nodes[6], w, c[6])
-    scatter(fc, nodes[7], w, c[7])
+    _add_corner_values(fc, nodes, w, in_row, c)
+
+
+@inline
+def _add_forces(u, f, nodes, g, coefficient, w, in_row, one):  # type: ignore[no-untyped-def]
+    """Add the forces of some lanes of a batch; their J."""
+    mx = _hexahedron_modes(u[0], nodes, g, w, in_row)
+    my = _hexahedron_modes(u[1], nodes, g, w, in_row)
+    mz = _hexahedron_modes(u[2], nodes, g, w, in_row)
+    mu = load(coefficient[0], w)
+    lam = load(coefficient[1], w)
+    k = load(coefficient[2], w)
+    p = first_piola(mx[:3] + my[:3] + mz[:3], mu, lam, one, None)
+    _add_hexahedron_forces(f[0], nodes, g, w, in_row, p[0], p[1], p[2], mx, k)
+    _add_hexahedron_forces(f[1], nodes, g, w, in_row, p[3], p[4], p[5], my, k)
+    _add_hexahedron_forces(f[2], nodes, g, w, in_row, p[6], p[7], p[8], mz, k)
+    return p[9]
 
 
 @kernel
-def hexahedron_forces(u, f, nodes, geometry, coefficient):  # type: ignore[no-untyped-def]
+def hexahedron_forces(u, f, nodes, in_row, geometry, coefficient):  # type: ignore[no-untyped-def]
     """Add the nodal forces of hexahedra of any shape to f; the smallest J among them.
 
-    nodes (n_batches, 8, lanes) uint32. geometry (n_batches, 30, lanes): the mean gradient of the sign vectors r, s, t,
-    rs, st, rt in x, y, z (1/m; that of rst is zero), then x^T H (m) of rs, st, rt, rst. coefficient (n_batches, 3,
-    lanes): mu V, lambda V (J), hourglass stiffness k (N/m); zero in lanes that only fill the last batch.
+    nodes (n_batches, 8, lanes) uint32. in_row (n_batches, vectors in a batch): whether the nodes of each corner follow
+    each other in the vector, and those of corners 1, 2, 5, 6 those of 0, 3, 4, 7: then nothing is gathered. geometry
+    (n_batches, 30, lanes): the mean gradient of the sign vectors r, s, t, rs, st, rt in x, y, z (1/m; that of rst is
+    zero), then x^T H (m) of rs, st, rt, rst. coefficient (n_batches, 3, lanes): mu V, lambda V (J), hourglass stiffness
+    k (N/m); zero in lanes that only fill the last batch.
     """
     one = u.dtype.type(1)
     least = spread(u.dtype.type(np.inf), u[0])
@@ -302,17 +353,12 @@ def hexahedron_forces(u, f, nodes, geometry, coefficient):  # type: ignore[no-un
         g = geometry[batch]
         prefetch(geometry[min(batch + U(1), last_batch)])
         for w in range(U(0), _BATCH, width(u[0])):
-            mx = _hexahedron_modes(u[0], at, g, w)
-            my = _hexahedron_modes(u[1], at, g, w)
-            mz = _hexahedron_modes(u[2], at, g, w)
-            mu = load(coefficient[batch, 0], w)
-            lam = load(coefficient[batch, 1], w)
-            k = load(coefficient[batch, 2], w)
-            p = first_piola(mx[:3] + my[:3] + mz[:3], mu, lam, one, None)
-            least = smaller(least, p[9])
-            _add_hexahedron_forces(f[0], at, g, w, p[0], p[1], p[2], mx, k)
-            _add_hexahedron_forces(f[1], at, g, w, p[3], p[4], p[5], my, k)
-            _add_hexahedron_forces(f[2], at, g, w, p[6], p[7], p[8], mz, k)
+            # In either way straight on: vectors stay in registers.
+            if in_row[batch, w // width(u[0])]:
+                J = _add_forces(u, f, at, g, coefficient[batch], w, True, one)
+            else:
+                J = _add_forces(u, f, at, g, coefficient[batch], w, None, one)
+            least = smaller(least, J)
     return smallest(least)
 
 
@@ -332,9 +378,9 @@ def hexahedron_survey(u, nodes, cells, geometry, coefficient, gram, stiffness, r
         at = nodes[batch]
         g = geometry[batch]
         for w in range(U(0), _BATCH, width(u[0])):
-            mx = _hexahedron_modes(u[0], at, g, w)
-            my = _hexahedron_modes(u[1], at, g, w)
-            mz = _hexahedron_modes(u[2], at, g, w)
+            mx = _hexahedron_modes(u[0], at, g, w, None)
+            my = _hexahedron_modes(u[1], at, g, w, None)
+            mz = _hexahedron_modes(u[2], at, g, w, None)
             batch_survey(mx[:3] + my[:3] + mz[:3], coefficient[batch], gram[batch], stiffness[batch], w, value, one)
             store(value[3], w, _squares(mx, my, mz))
         for w in range(_BATCH):
