@@ -127,7 +127,7 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
     )
     predict.add_argument("--latency", type=float, metavar="US", help="microseconds a message takes (1.5)")
     predict.add_argument("--bandwidth", type=float, metavar="GB/S", help="of one rank, in each direction (10)")
-    predict.add_argument("--rate", type=float, metavar="M", help="million hexahedra a second of one core (25)")
+    predict.add_argument("--rate", type=float, metavar="M", help="million boxes a second of one core (60)")
     predict.add_argument("--fixed", type=float, metavar="US", help="microseconds of a step that depend on no size (15)")
     predict.add_argument("--out", type=Path, metavar="DIR", help="folder of predict.csv and predict.png (the model's)")
 

@@ -115,6 +115,12 @@ def read_cells(path: Path) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArra
         return file["hexahedra"][...], file["domains"][...], file["domain_points"][...]
 
 
+def read_points(path: Path) -> NDArray[np.float64]:
+    """Places (n_nodes, 3), m, of the nodes."""
+    with _open_model(path) as file:
+        return np.asarray(file["points"][...], np.float64)
+
+
 def model_key(path: Path) -> str | None:
     """The key that the model was written with; None if there is no model of this layout."""
     try:

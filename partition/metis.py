@@ -10,30 +10,29 @@ from partition.graph import CellGraph
 #: Tries of every bisection, of which METIS keeps the best: four cut 4 % fewer nodes than one, eight hardly fewer.
 TRIES = 4
 
-#: METIS counts in integers: the cost of the cheaper kind of cell in them, hence costs are right to 0.5 %.
+#: METIS counts in integers: the cost of the cheapest cell in them, hence costs are right to 0.5 %.
 COST_UNITS = 100
 
 
-def cut(graph: CellGraph, n_parts: int, weights: tuple[float, float], seed: int = 0) -> NDArray[np.int32]:
+def cut(graph: CellGraph, n_parts: int, costs: NDArray[np.float64], seed: int = 0) -> NDArray[np.int32]:
     """The part of each cell, (n_cells,): parts of equal cost that few edges join.
 
-    `weights` are the costs of a hexahedron and of a support domain, in any unit. The same graph, weights and seed give
-    the same parts. METIS bisects again and again, each time to 0.1 % or to two cells, whichever is more. ValueError
-    where there are fewer cells than parts or a cost is not positive.
+    `costs` (n_cells,) are those of the cells, in any unit. The same graph, costs and seed give the same parts. METIS
+    bisects again and again, each time to 0.1 % or to two cells, whichever is more. ValueError where there are fewer
+    cells than parts or a cost is not positive.
     """
     if n_parts < 1:
         raise ValueError(f"cannot cut into {n_parts} parts: at least 1 is needed")
     if n_parts > graph.n_cells:
         raise ValueError(f"cannot cut {graph.n_cells} cells into {n_parts} parts: take at most one part for each cell")
-    if not (min(weights) > 0 and np.isfinite(weights).all()):
-        raise ValueError(f"cell costs must be positive numbers, not {weights[0]} and {weights[1]}")
+    if not (costs.min() > 0 and np.isfinite(costs).all()):
+        raise ValueError(f"cell costs must be positive numbers, not {costs.min()} to {costs.max()}")
     if n_parts == 1:
         return np.zeros(graph.n_cells, dtype=np.int32)
     import pymetis
 
     integer = pymetis.zero_copy_dtype()
-    units = np.rint(np.array(weights) / min(weights) * COST_UNITS).astype(integer)
-    cost = np.repeat(units, [graph.n_hexahedra, graph.n_cells - graph.n_hexahedra])
+    cost = np.rint(costs / costs.min() * COST_UNITS).astype(integer)
     if max(cost.sum(dtype=np.float64), graph.adjncy.size) > np.iinfo(integer).max:
         raise ValueError(f"{graph.n_cells} cells are too many for this METIS, which counts in {integer}")
     part = pymetis.part_graph(

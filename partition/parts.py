@@ -117,7 +117,7 @@ class PartFigures:
 
     hexahedra: NDArray[np.int64]  # (n_parts,)
     domains: NDArray[np.int64]  # (n_parts,)
-    cost: NDArray[np.float64]  # (n_parts,), in the unit of the weights
+    cost: NDArray[np.float64]  # (n_parts,), in the unit of the cells' costs
     nodes: NDArray[np.int64]  # (n_parts,), shared ones included
     halo_nodes: NDArray[np.int64]  # (n_parts,), nodes that other parts touch too
     sent_nodes: NDArray[np.int64]  # (n_parts,), sent in an exchange: halo nodes, once to each part that has them
@@ -162,9 +162,9 @@ class PartFigures:
 
 
 def figures(
-    tables: PartTables, weights: tuple[float, float], n_hexahedra: int, graph: CellGraph | None = None
+    tables: PartTables, costs: NDArray[np.float64], n_hexahedra: int, graph: CellGraph | None = None
 ) -> PartFigures:
-    """Figures of a partition whose cells cost `weights` (a hexahedron, a support domain); cut edges with the graph."""
+    """Figures of a partition whose cells cost `costs` (n_cells,); cut edges with the graph."""
     sizes = np.diff(tables.cell_offsets)
     part = np.empty(len(tables.cells), dtype=np.int32)
     part[tables.cells] = np.repeat(np.arange(tables.n_parts, dtype=np.int32), sizes)
@@ -178,7 +178,7 @@ def figures(
     return PartFigures(
         hexahedra=hexahedra,
         domains=sizes - hexahedra,
-        cost=weights[0] * hexahedra + weights[1] * (sizes - hexahedra),
+        cost=np.bincount(part, costs, tables.n_parts).astype(np.float64, copy=False),
         nodes=np.diff(tables.node_offsets),
         halo_nodes=np.bincount(of_node[n_touching[tables.nodes] > 1], minlength=tables.n_parts),
         sent_nodes=np.diff(tables.shared_offsets[tables.neighbour_offsets]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from mpitled.material import Material, first_piola, strain_energy
 from mpitled.mesh import CORNERS, grid_points, structured_hexahedra
 from mpitled.solver import hexahedra, kernels
 from mpitled.solver.step import State, at_rest, compose_forces, compose_march
-from mpitled.solver.subdomain import localise
+from mpitled.solver.subdomain import DOMAIN_NODE_COST, GATHERED_COST, cell_costs, localise
 from mpitled.solver.survey import Survey
 from mpitled.store import PartRows
 
@@ -133,11 +134,21 @@ def forces(sub, state):
 
 SCENES = {
     "voxels": lambda: part(*box()[:2], *no_domains(), box()[2]),
+    "voxels along y": lambda: turned(1),
+    "voxels along z": lambda: turned(2),
+    "distorted along z": lambda: turned(2, 0.15),
     "distorted": lambda: part(*box(distortion=0.15)[:2], *no_domains(), box()[2]),
     "voxels and distorted": lambda: mixed_shapes(),
     "domains": lambda: all_domains(8),
     "domains of 13 nodes": lambda: all_domains(13),
 }
+
+
+def turned(axis, distortion=0.0):
+    """Bricks whose nodes follow each other along another axis than x."""
+    points, cells, material = box(distortion=distortion)
+    order = [CORNERS.tolist().index(np.roll(corner, -axis).tolist()) for corner in CORNERS]
+    return part(np.roll(points * [1.0, 0.7, 1.5], axis, axis=1), cells[:, order], *no_domains(), material)
 
 
 def mixed_shapes():
@@ -171,6 +182,32 @@ def test_forces_energies_and_jacobians_are_those_of_the_plain_formulas(scene, st
     assert seen.jacobian[:-1] == pytest.approx(J, rel=1e-13)
     assert figures["strain"] == pytest.approx(strain, rel=1e-10)  # W is a small difference of (J - 1) and ln J
     assert figures["hourglass"] + figures["stabilisation"] == pytest.approx(resisted, rel=1e-12)
+
+
+def test_nodes_behind_a_run_are_no_cell():
+    """Stretched by an edge, a line's last node and the next line's first would be a cell of no volume."""
+    edge = 2.0**-9
+    points, cells, _ = box((6, 3, 2), edge)
+    rows = part(points, cells, *no_domains(), np.zeros(len(cells), np.int64))
+    u = points * [1 / 6, 0.0, 0.0]
+    sub = localise(rows, HOURGLASS, 0.0, "mean")
+    assert sub.runs is not None
+    state = at(sub, u)
+    found = forces(sub, state)
+    expected = plain(rows, u, 0.0)[0]
+    assert np.abs(found - expected).max() < 1e-13 * np.abs(expected).max()
+    assert state.smallest_jacobian == 1.0  # that of rest: no cell is compressed
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_cells_cost_by_what_computes_them(scene):
+    rows = SCENES[scene]()
+    sub = localise(replace(rows, material=0 * rows.material), HOURGLASS, 0.1, "mean")
+    costs = cell_costs(rows.points, rows.hexahedra, rows.domains)
+    in_runs = int(sub.runs.length.sum()) if sub.runs else 0
+    of_domain = DOMAIN_NODE_COST * rows.domains.shape[1]
+    expected = [1.0] * in_runs + [GATHERED_COST] * (len(rows.hexahedra) - in_runs) + [of_domain] * len(rows.domains)
+    assert sorted(costs) == sorted(expected)
 
 
 @pytest.mark.parametrize("scene", SCENES)

@@ -17,7 +17,7 @@ from partition import CellGraph, PartTables, cell_graph, cut, figures, tables
 
 NO_DOMAINS = np.empty((0, 8), dtype=np.int64)
 NO_POINTS = np.empty((0, 3))
-COSTS = (1.0, 1.3)
+COSTS = (1.0, 1.3)  # of a hexahedron and of a support domain
 
 
 def mixed(
@@ -35,6 +35,10 @@ def mixed(
     domain_points = domain_points[rng.random(len(domain_points)) < share]
     domain_points += rng.uniform(-0.1 / n, 0.1 / n, domain_points.shape)
     return hexahedra[~in_core], cKDTree(points).query(domain_points, k=nodes)[1], domain_points
+
+
+def costs(hexahedra: NDArray[np.int64], domains: NDArray[np.int64]) -> NDArray[np.float64]:
+    return np.repeat(COSTS, [len(hexahedra), len(domains)])
 
 
 def edges(graph: CellGraph) -> set[tuple[int, int]]:
@@ -103,13 +107,13 @@ def test_graph_is_in_one_piece_where_the_mesh_is():
 def test_parts_have_equal_cost_and_their_tables_agree(scene, n_parts):
     hexahedra, domains, points = mixed(10, core={"hexahedra": 0.0, "cloud": 1.1, "mixed": 0.5}[scene], share=0.4)
     graph = cell_graph(hexahedra, domains, points)
-    part = cut(graph, n_parts, COSTS, seed=3)
-    assert np.array_equal(part, cut(graph, n_parts, COSTS, seed=3))
+    part = cut(graph, n_parts, costs(hexahedra, domains), seed=3)
+    assert np.array_equal(part, cut(graph, n_parts, costs(hexahedra, domains), seed=3))
     assert part.dtype == np.int32
     assert set(part) == set(range(n_parts))
 
     found = tables(hexahedra, domains, part, n_parts)
-    quality = figures(found, COSTS, len(hexahedra), graph)
+    quality = figures(found, costs(hexahedra, domains), len(hexahedra), graph)
     # METIS leaves a bisection within 0.1 % or two mean cells; halved again and again, these add up to four cells.
     mean = quality.cost.mean()
     assert quality.cost.max() <= mean * 1.001 ** np.ceil(np.log2(n_parts)) + 4 * max(COSTS)
@@ -150,9 +154,9 @@ def check_tables(
 def test_parts_without_one_kind_of_cell():
     """Both occur where the core is several parts wide."""
     hexahedra, domains, points = mixed(10, core=0.7)
-    part = cut(cell_graph(hexahedra, domains, points), 32, COSTS)
+    part = cut(cell_graph(hexahedra, domains, points), 32, costs(hexahedra, domains))
     found = tables(hexahedra, domains, part, 32)
-    quality = figures(found, COSTS, len(hexahedra))
+    quality = figures(found, costs(hexahedra, domains), len(hexahedra))
     assert (quality.domains == 0).any()
     assert (quality.hexahedra == 0).any()
     assert quality.cut is None
@@ -163,26 +167,26 @@ def test_one_part_needs_no_metis(monkeypatch):
     monkeypatch.setitem(sys.modules, "pymetis", None)
     hexahedra, domains, points = mixed(4)
     graph = cell_graph(hexahedra, domains, points)
-    part = cut(graph, 1, COSTS)
+    part = cut(graph, 1, costs(hexahedra, domains))
     assert part.dtype == np.int32
     assert part.tolist() == [0] * graph.n_cells
     found = tables(hexahedra, domains, part, 1)
     check_tables(found, hexahedra, domains, part, 1)
     with pytest.raises(ImportError):
-        cut(graph, 2, COSTS)
+        cut(graph, 2, costs(hexahedra, domains))
 
 
 def test_as_many_parts_as_cells_but_no_more():
     """METIS leaves a part of 27 single cells empty; none is in the end."""
     block = structured_hexahedra((3, 3, 3))
     graph = cell_graph(block, NO_DOMAINS, NO_POINTS)
-    assert sorted(cut(graph, 27, COSTS)) == list(range(27))
+    assert sorted(cut(graph, 27, np.ones(27))) == list(range(27))
     with pytest.raises(ValueError, match="cannot cut 27 cells into 28 parts"):
-        cut(graph, 28, COSTS)
+        cut(graph, 28, np.ones(27))
     with pytest.raises(ValueError, match="cannot cut into 0 parts"):
-        cut(graph, 0, COSTS)
+        cut(graph, 0, np.ones(27))
     with pytest.raises(ValueError, match="costs must be positive"):
-        cut(graph, 2, (1.0, 0.0))
+        cut(graph, 2, np.arange(27.0))
 
 
 def test_edge_weights_leave_fewer_halo_nodes():
@@ -191,7 +195,7 @@ def test_edge_weights_leave_fewer_halo_nodes():
     graph = cell_graph(hexahedra, domains, points)
     halo = {}
     for name, weighed in {"nets": graph, "alike": replace(graph, edge_weights=None)}.items():
-        parts = [cut(weighed, 2, COSTS, seed) for seed in range(3)]
+        parts = [cut(weighed, 2, costs(hexahedra, domains), seed) for seed in range(3)]
         halo[name] = sum(len(tables(hexahedra, domains, part, 2).shared) for part in parts)
     assert halo["nets"] < halo["alike"]
 
@@ -200,19 +204,20 @@ def test_edge_weights_leave_fewer_halo_nodes():
 def test_four_million_hexahedra():
     """Seconds and peak memory of graph, cut and tables; run with -s to see them, alone in a process."""
     tables_of_few = structured_hexahedra((4, 4, 4))
-    tables(tables_of_few, NO_DOMAINS, cut(cell_graph(tables_of_few, NO_DOMAINS, NO_POINTS), 2, COSTS), 2)
+    tables(tables_of_few, NO_DOMAINS, cut(cell_graph(tables_of_few, NO_DOMAINS, NO_POINTS), 2, np.ones(64)), 2)
     block = structured_hexahedra((160, 160, 157))
+    alike = np.ones(len(block))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     start = time.perf_counter()
     graph = cell_graph(block, NO_DOMAINS, NO_POINTS)
     print(f"\ngraph {time.perf_counter() - start:.1f} s")
-    part = cut(graph, 2, COSTS)
+    part = cut(graph, 2, alike)
     print(f"cut {time.perf_counter() - start:.1f} s")
     found = tables(block, NO_DOMAINS, part, 2)
     seconds = time.perf_counter() - start
     peak = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024 / len(block)
     print(f"tables {seconds:.1f} s, peak {peak:.0f} bytes a cell")
-    print(figures(found, COSTS, len(block), graph).describe())
+    print(figures(found, alike, len(block), graph).describe())
     # Under 3 minutes and 1 KB a cell together with building the model: half of both is ours at most.
     assert seconds < 90
     assert peak < 500

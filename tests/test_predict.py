@@ -28,9 +28,10 @@ def test_a_steps_time_is_that_of_the_slowest_rank():
     """A bar of 6 x 2 x 2 hexahedra, cut by hand in 1, 2 and 3 layers: 9 nodes between neighbours."""
     hexahedra = structured_hexahedra((6, 2, 2))
     part = np.array([0, 1, 1, 2, 2, 2], np.int32)[np.arange(24) % 6]
-    costs = (1.0, 3.6)
     tables = partition.tables(hexahedra, np.empty((0, 12), np.int64), part, 3)
-    row = step_time(partition.figures(tables, costs, 24), Cluster(latency=5e-6, bandwidth=1e9, rate=1e6, fixed=2e-6))
+    row = step_time(
+        partition.figures(tables, np.ones(24), 24), Cluster(latency=5e-6, bandwidth=1e9, rate=1e6, fixed=2e-6)
+    )
     # Ranks have 4, 8, 12 cells, a us each, and 1, 2, 1 neighbours.
     transfer = 9 * 24 / 1e9 * 1e6
     steps = np.array([4 + 5 + transfer, 8 + 10 + 2 * transfer, 12 + 5 + transfer]) + 2
@@ -56,8 +57,8 @@ def test_every_number_of_parts_is_cut_as_metis_cuts_it(tmp_path):
     graph = partition.cell_graph(hexahedra, none, np.empty((0, 3)))
     for row in rows:
         n = int(row["parts"])
-        part = partition.cut(graph, n, (1.0, 3.6))
-        direct = partition.figures(partition.tables(hexahedra, none, part, n), (1.0, 3.6), len(hexahedra))
+        part = partition.cut(graph, n, np.ones(24**3))
+        direct = partition.figures(partition.tables(hexahedra, none, part, n), np.ones(24**3), len(hexahedra))
         assert float(row["balance"]) == pytest.approx(direct.balance, abs=0.005)
         assert float(row["halo_nodes_mean"]) == pytest.approx(direct.halo_nodes.mean(), rel=0.1)  # another chance
 

@@ -30,11 +30,9 @@ from mpitled.solver.memory import Kept, Memory, Parts, recall, remember
 from mpitled.solver.progress import Interrupts, Phases, Progress
 from mpitled.solver.relaxation import Relaxation
 from mpitled.solver.step import State, Term
-from mpitled.solver.subdomain import Subdomain, localise
+from mpitled.solver.subdomain import Subdomain, cell_costs, localise
 from mpitled.solver.watch import Watch
 
-#: Cost in a step of a node of a support domain, in hexahedra, as `pytest -m study tests/test_kernels.py` measures it.
-DOMAIN_NODE_COST = 0.3
 #: Looks from one state that recovery can go back to until the next, and how often a run may go back.
 SAVED, RECOVERIES = 5, 5
 #: What `solver.precision` means for the cells' arithmetic.
@@ -82,7 +80,7 @@ def included(deck: Deck) -> list[Path]:
 def divide(path: Path, n_parts: int, seed: int) -> str:
     """Partition a model in n_parts, stored in its file under that number; a table of the parts."""
     hexahedra, domains, places = store.read_cells(path)
-    costs = (1.0, DOMAIN_NODE_COST * domains.shape[1])
+    costs = cell_costs(store.read_points(path), hexahedra, domains)
     graph = partition.cell_graph(hexahedra, domains, places)
     try:
         part = partition.cut(graph, n_parts, costs, seed)

@@ -87,14 +87,16 @@ def compose_forces(sub: Subdomain, halo: Halo | None) -> tuple[Term, ...]:
     if runs is not None:
 
         def voxels(s: State) -> None:
-            J = kernels.voxel_forces(s.seen, s.f, runs.start, runs.length, runs.scale, runs.coefficient)
+            J = kernels.voxel_forces(s.seen, s.f, runs.line, runs.length, runs.along, runs.scale, runs.coefficient)
             s.smallest_jacobian = min(s.smallest_jacobian, J)
 
         terms.append(("voxel hexahedra", voxels))
     if hexahedra is not None:
 
         def general(s: State) -> None:
-            J = kernels.hexahedron_forces(s.seen, s.f, hexahedra.nodes, hexahedra.geometry, hexahedra.coefficient)
+            J = kernels.hexahedron_forces(
+                s.seen, s.f, hexahedra.nodes, hexahedra.in_row, hexahedra.geometry, hexahedra.coefficient
+            )
             s.smallest_jacobian = min(s.smallest_jacobian, J)
 
         terms.append(("hexahedra", general))

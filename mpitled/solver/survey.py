@@ -40,7 +40,17 @@ class Survey:
         strain = hourglass = stabilisation = 0.0
         if (r := sub.runs) is not None:
             strain, hourglass = kernels.voxel_survey(
-                s.seen, r.start, r.length, r.first_cell, r.scale, r.coefficient, r.gram, required, factor, jacobian
+                s.seen,
+                r.line,
+                r.length,
+                r.along,
+                r.first_cell,
+                r.scale,
+                r.coefficient,
+                r.gram,
+                required,
+                factor,
+                jacobian,
             )
         if (h := sub.hexahedra) is not None:
             more, resisted = kernels.hexahedron_survey(

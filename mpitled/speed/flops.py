@@ -61,6 +61,8 @@ def _plain(number: Any) -> Any:
 
 def _counted(operation: Callable[[Any, Any], Any]) -> Callable[[Counting, Any], Counting]:
     def act(self: Counting, other: Any) -> Counting:
+        if isinstance(other, np.ndarray):
+            return NotImplemented  # each of its numbers for itself
         Counting.operations += 1
         return Counting(operation(self.value, _plain(other)))
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import partition
 from mpitled import atomic, store
 from mpitled.errors import InputError
-from mpitled.solver.run import DOMAIN_NODE_COST
+from mpitled.solver.subdomain import DOMAIN_NODE_COST, cell_costs
 
 COLUMNS = (
     "parts", "cells_mean", "cells_largest", "balance", "halo_nodes_mean", "halo_nodes_largest", "neighbours_mean",
@@ -29,13 +29,13 @@ class Cluster:
 
     latency: float = 1.5e-6  # s, of one message
     bandwidth: float = 10e9  # bytes/s, of one rank, in each direction
-    rate: float = 25e6  # hexahedra a second on one core, the nodes' update in it
+    rate: float = 60e6  # boxes in runs a second on one core, the nodes' update in it
     fixed: float = 15e-6  # s a step that depend on no size: Python, and the start of kernels and requests
 
     def assumptions(self) -> str:
         """All of them in two lines."""
         return (
-            f"{self.rate / 1e6:g} M hexahedra a second a core (a support domain's node costs {DOMAIN_NODE_COST:g}), "
+            f"{self.rate / 1e6:g} M boxes a second a core (a support domain's node costs {DOMAIN_NODE_COST:g}), "
             f"{1e6 * self.fixed:g} us a step whatever the size,\n{1e6 * self.latency:g} us a message, "
             f"{self.bandwidth / 1e9:g} GB/s a rank; no contention in the network, no noise; the slowest rank counts"
         )
@@ -47,7 +47,7 @@ def predict(path: Path, counts: Sequence[int], cluster: Cluster, out: Path, seed
     The model is not changed. InputError if it has fewer cells than parts.
     """
     hexahedra, domains, places = store.read_cells(path)
-    costs = (1.0, DOMAIN_NODE_COST * domains.shape[1])
+    costs = cell_costs(store.read_points(path), hexahedra, domains)
     _say(f"{len(hexahedra)} hexahedra, {len(domains)} support domains: graph")
     graph = partition.cell_graph(hexahedra, domains, places)
     rows: list[dict[str, Any]] = []

@@ -1,0 +1,33 @@
+"""The compiled kernels of a step: nodal forces, the survey of the cells, the central-difference update, packing.
+
+Nodal arrays are component-major, (3, n_nodes + PADDING). Every index is unsigned, because numba's test for negative
+indices stops the vectoriser. Forces are *internal* forces f; the equation of motion is m a = -f at free nodes. All are
+in SI units, and run in the precision of the arrays that they are given. Constants are cast (`u.dtype.type`), or float32
+would be promoted.
+"""
+
+from mpitled.solver.kernels.domains import domain_forces, domain_survey
+from mpitled.solver.kernels.hexahedra import hexahedron_forces, hexahedron_survey, voxel_forces, voxel_survey
+from mpitled.solver.kernels.lanes import BATCH as BATCH_LANES
+from mpitled.solver.kernels.nodes import (
+    change_step,
+    clear,
+    follow,
+    kinetic_energy,
+    pack,
+    raise_mass,
+    react,
+    relax,
+    renew_tensors,
+    unpack,
+    update,
+    watch_relaxation,
+)  # fmt: skip
+
+PADDING = BATCH_LANES  # the last vector of a run reads beyond the run's nodes, and adds nothing there
+
+__all__ = [
+    "BATCH_LANES", "PADDING", "change_step", "clear", "domain_forces", "domain_survey", "follow", "hexahedron_forces",
+    "hexahedron_survey", "kinetic_energy", "pack", "raise_mass", "react", "relax", "renew_tensors", "unpack", "update",
+    "voxel_forces", "voxel_survey", "watch_relaxation",
+]  # fmt: skip

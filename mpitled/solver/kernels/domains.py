@@ -1,0 +1,262 @@
+"""Kernels of support domains, gathered: any number of nodes, stabilised or the paper's own."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import uint64 as U
+
+from mpitled.solver.kernels.lanes import (
+    BATCH,
+    gather,
+    load,
+    magnitude,
+    root,
+    scatter,
+    smaller,
+    smallest,
+    spread,
+    store,
+    width,
+)  # fmt: skip
+from mpitled.solver.kernels.stress import batch_survey, cofactor, first_piola, inline, kernel
+
+_BATCH = np.uint64(BATCH)
+
+
+@inline
+def _add_products(sums, number, x, y, z):  # type: ignore[no-untyped-def]
+    return sums[0] + number * x, sums[1] + number * y, sums[2] + number * z
+
+
+@inline
+def _affine(total, sums, inverse, w, share):  # type: ignore[no-untyped-def]
+    """Mean and the three slopes of the affine part of one component: (X^T X)^-1 X^T u.
+
+    total: of u over the nodes; sums: of u X_a, with X from their mean; inverse (6, lanes): of X^T X.
+    """
+    x, y, z = sums
+    return (
+        total * share,
+        load(inverse[0], w) * x + load(inverse[1], w) * y + load(inverse[2], w) * z,
+        load(inverse[1], w) * x + load(inverse[3], w) * y + load(inverse[4], w) * z,
+        load(inverse[2], w) * x + load(inverse[4], w) * y + load(inverse[5], w) * z,
+    )
+
+
+@inline
+def _remainder(number, affine, x, y, z):  # type: ignore[no-untyped-def]
+    """A component of a node's displacement less its affine part: Q u. Q is symmetric: momentum and moment are kept."""
+    return (number - affine[0]) - (affine[1] * x + affine[2] * y + affine[3] * z)
+
+
+@inline
+def _domain_modes(u, nodes, gradient, position, inverse, w, ue):  # type: ignore[no-untyped-def]
+    """grad u (a tuple of 9), and for each component the affine part of u, by the nodes' unweighted linear projector.
+
+    Of one batch's lanes from w on; fills ue (3 n, lanes) with the nodes' displacements. Without position the affine
+    parts are nothing.
+    """
+    n = U(nodes.shape[0])
+    share = u.dtype.type(1) / u.dtype.type(nodes.shape[0])
+    zeros = spread(u.dtype.type(0), u[0])
+    gx = (zeros, zeros, zeros)
+    gy = (zeros, zeros, zeros)
+    gz = (zeros, zeros, zeros)
+    sx = (zeros, zeros, zeros)
+    sy = (zeros, zeros, zeros)
+    sz = (zeros, zeros, zeros)
+    tx = zeros
+    ty = zeros
+    tz = zeros
+    for a in range(n):
+        i = U(3) * a
+        ux = gather(u[0], nodes[a], w)
+        uy = gather(u[1], nodes[a], w)
+        uz = gather(u[2], nodes[a], w)
+        x = load(gradient[i], w)
+        y = load(gradient[i + U(1)], w)
+        z = load(gradient[i + U(2)], w)
+        gx = _add_products(gx, ux, x, y, z)
+        gy = _add_products(gy, uy, x, y, z)
+        gz = _add_products(gz, uz, x, y, z)
+        if position is not None:
+            x = load(position[i], w)
+            y = load(position[i + U(1)], w)
+            z = load(position[i + U(2)], w)
+            sx = _add_products(sx, ux, x, y, z)
+            sy = _add_products(sy, uy, x, y, z)
+            sz = _add_products(sz, uz, x, y, z)
+            tx = tx + ux
+            ty = ty + uy
+            tz = tz + uz
+            store(ue[i], U(0), ux)
+            store(ue[i + U(1)], U(0), uy)
+            store(ue[i + U(2)], U(0), uz)
+    none = (zeros, zeros, zeros, zeros)
+    if position is not None:
+        return (
+            gx + gy + gz, _affine(tx, sx, inverse, w, share), _affine(ty, sy, inverse, w, share),
+            _affine(tz, sz, inverse, w, share),
+        )  # fmt: skip
+    return gx + gy + gz, none, none, none
+
+
+@kernel
+def domain_forces(u, f, nodes, gradient, position, inverse, coefficient):  # type: ignore[no-untyped-def]
+    """Add the nodal forces of support domains to f; the smallest J among them.
+
+    nodes (n_batches, n, lanes) uint32; gradient and position (n_batches, 3 n, lanes), 1/m and m; inverse (n_batches, 6,
+    lanes), 1/m^2; coefficient (n_batches, 3, lanes): mu V, lambda V (J), stabilisation kappa (N/m). position and
+    inverse are None where there is no stabilisation (the paper's own).
+    """
+    n = U(nodes.shape[1])
+    one = u.dtype.type(1)
+    least = spread(u.dtype.type(np.inf), u[0])
+    ue = np.empty((3 * nodes.shape[1], width(u[0])), u.dtype)
+    for batch in range(U(nodes.shape[0])):
+        at = nodes[batch]
+        b = gradient[batch]
+        X = position[batch] if position is not None else None
+        inner = inverse[batch] if inverse is not None else None
+        for w in range(U(0), _BATCH, width(u[0])):
+            grad, ax, ay, az = _domain_modes(u, at, b, X, inner, w, ue)
+            mu = load(coefficient[batch, 0], w)
+            lam = load(coefficient[batch, 1], w)
+            p = first_piola(grad, mu, lam, one, None)
+            least = smaller(least, p[9])
+            for a in range(n):
+                i = U(3) * a
+                x = load(b[i], w)
+                y = load(b[i + U(1)], w)
+                z = load(b[i + U(2)], w)
+                fx = p[0] * x + p[1] * y + p[2] * z
+                fy = p[3] * x + p[4] * y + p[5] * z
+                fz = p[6] * x + p[7] * y + p[8] * z
+                if position is not None:
+                    k = load(coefficient[batch, 2], w)
+                    x = load(X[i], w)
+                    y = load(X[i + U(1)], w)
+                    z = load(X[i + U(2)], w)
+                    fx = fx + k * _remainder(load(ue[i], U(0)), ax, x, y, z)
+                    fy = fy + k * _remainder(load(ue[i + U(1)], U(0)), ay, x, y, z)
+                    fz = fz + k * _remainder(load(ue[i + U(2)], U(0)), az, x, y, z)
+                scatter(f[0], at[a], w, fx)
+                scatter(f[1], at[a], w, fy)
+                scatter(f[2], at[a], w, fz)
+    return smallest(least)
+
+
+@inline
+def _image(k, x, y, z):  # type: ignore[no-untyped-def]
+    """K B_a, the direction in which a node's material stiffness acts."""
+    return k[0] * x + k[1] * y + k[2] * z, k[3] * x + k[4] * y + k[5] * z, k[6] * x + k[7] * y + k[8] * z
+
+
+@inline
+def _length(v):  # type: ignore[no-untyped-def]
+    return root(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+
+
+@inline
+def _add_tensors(grad, nodes, gradient, coefficient, stiffness, w, tensor, factor, one, value):  # type: ignore[no-untyped-def]
+    """Add the bounds of some lanes' stiffness at their nodes, times factor, to tensor (6, n_nodes).
+
+    value (6, lanes): scratch.
+    """
+    n = U(nodes.shape[0])
+    tiny = value.dtype.type(1e-30)
+    a, b, c, d, e, f, g, h, i = grad
+    a = a + one
+    e = e + one
+    i = i + one
+    k = cofactor(a, b, c, d, e, f, g, h, i)
+    J = k[9]
+    square = a * a + b * b + c * c + d * d + e * e + f * f + g * g + h * h + i * i
+    sum_g = spread(value.dtype.type(0), value[0])
+    sum_b = sum_g
+    for m in range(n):
+        B = (load(gradient[U(3) * m], w), load(gradient[U(3) * m + U(1)], w), load(gradient[U(3) * m + U(2)], w))
+        sum_g = sum_g + _length(_image(k, B[0], B[1], B[2]))
+        sum_b = sum_b + _length(B)
+    mu = load(coefficient[0], w)
+    lam = load(coefficient[1], w)
+    q = lam * (J - one) - mu / J
+    along = factor * (lam + mu / (J * J)) * sum_g
+    alike = factor * (mu + magnitude(q) * root((one + one) * square)) * sum_b
+    for m in range(n):
+        B = (load(gradient[U(3) * m], w), load(gradient[U(3) * m + U(1)], w), load(gradient[U(3) * m + U(2)], w))
+        G = _image(k, B[0], B[1], B[2])
+        s = along / (_length(G) + tiny)
+        same = alike * _length(B) + factor * load(stiffness, w)
+        store(value[0], U(0), s * G[0] * G[0] + same)
+        store(value[1], U(0), s * G[0] * G[1])
+        store(value[2], U(0), s * G[0] * G[2])
+        store(value[3], U(0), s * G[1] * G[1] + same)
+        store(value[4], U(0), s * G[1] * G[2])
+        store(value[5], U(0), s * G[2] * G[2] + same)
+        for lane in range(width(value[0])):
+            for j in range(6):
+                tensor[j, nodes[m, w + lane]] += value[j, lane]
+
+
+@kernel
+def domain_survey(  # type: ignore[no-untyped-def]
+    u,
+    nodes,
+    cells,
+    gradient,
+    position,
+    inverse,
+    coefficient,
+    gram,
+    stiffness,
+    required,
+    factor,
+    jacobian,
+    tensor,
+):
+    """As `hexahedron_survey`, of support domains: strain energy and stabilisation energy.
+
+    Where tensor (6, n_nodes) is given, it takes what the domains ask, as tensors, in place of required. A domain's
+    material stiffness is that of one direction g_a = K B_a at each node: c (sum_a g_a . u_a)^2. By Cauchy's inequality
+    that is at most c (sum_b |g_b|) sum_a (g_a . u_a)^2 / |g_a|; the rest is bounded alike with |B_a|. Next to a grown
+    tumour the first is large across the thin layers and small along them.
+    """
+    n = U(nodes.shape[1])
+    one = u.dtype.type(1)
+    factor = u.dtype.type(factor)
+    ue = np.empty((3 * nodes.shape[1], width(u[0])), u.dtype)
+    value = np.empty((4, BATCH), u.dtype)
+    scratch = np.empty((6, width(u[0])), u.dtype)
+    strain = 0.0
+    stabilisation = 0.0
+    for batch in range(U(nodes.shape[0])):
+        at = nodes[batch]
+        b = gradient[batch]
+        X = position[batch] if position is not None else None
+        inner = inverse[batch] if inverse is not None else None
+        for w in range(U(0), _BATCH, width(u[0])):
+            grad, ax, ay, az = _domain_modes(u, at, b, X, inner, w, ue)
+            batch_survey(grad, coefficient[batch], gram[batch], stiffness[batch], w, value, one)
+            squares = spread(u.dtype.type(0), u[0])
+            if position is not None:
+                for a in range(n):
+                    i = U(3) * a
+                    x = load(X[i], w)
+                    y = load(X[i + U(1)], w)
+                    z = load(X[i + U(2)], w)
+                    rx = _remainder(load(ue[i], U(0)), ax, x, y, z)
+                    ry = _remainder(load(ue[i + U(1)], U(0)), ay, x, y, z)
+                    rz = _remainder(load(ue[i + U(2)], U(0)), az, x, y, z)
+                    squares = squares + (rx * rx + ry * ry + rz * rz)
+            store(value[3], w, squares)
+            if tensor is not None:
+                _add_tensors(grad, at, b, coefficient[batch], stiffness[batch], w, tensor, factor, one, scratch)
+        for w in range(_BATCH):
+            jacobian[cells[batch, w]] = value[0, w]
+            strain += value[1, w] - coefficient[batch, 0, w] * np.log(value[0, w])
+            stabilisation += coefficient[batch, 2, w] * value[3, w]
+            if tensor is None:
+                for a in range(n):
+                    required[at[a, w]] += factor * value[2, w]
+    return strain, 0.5 * stabilisation

@@ -1,0 +1,323 @@
+"""Vectors for the kernels: numbers that fill a register of 512 bits, one of each cell that is worked on at once.
+
+Numba's vectoriser keeps what lies between two loops in memory, and gathers one number at a time. Here kernels say
+themselves what is a vector. A processor with narrower registers takes several for one vector. Everything works in plain
+Python as well, on arrays of numpy, which is how operations are counted. Indices are unsigned (numba.uint64).
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.datamodel import models
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import lower_builtin, register_model
+
+BITS = 512
+#: Lanes of one batch of gathered cells: of a vector of the narrowest numbers.
+BATCH = BITS // 32
+# Fused multiply-adds and free association, but NaN and infinity stay what they are: the watch needs them.
+FAST = {"contract", "nsz", "arcp", "reassoc"}
+_FLAGS = tuple(sorted(FAST))
+
+
+class Lanes(types.Type):
+    """Numba's type of a vector of numbers of some floating-point type."""
+
+    def __init__(self, dtype: types.Float) -> None:
+        self.dtype = dtype
+        self.width = BITS // dtype.bitwidth
+        super().__init__(name=f"Lanes({dtype})")
+
+
+@register_model(Lanes)
+class _Model(models.PrimitiveModel):
+    def __init__(self, manager: Any, lanes: Lanes) -> None:
+        value = manager.lookup(lanes.dtype).get_value_type()
+        super().__init__(manager, lanes, ir.VectorType(value, lanes.width))
+
+
+# ---------------------------------------------------------------- what kernels call, in plain Python
+
+
+def width(row):  # type: ignore[no-untyped-def]
+    """Lanes of a vector of the numbers in this array."""
+    return np.uint64(8 if row.dtype == object else BITS // 8 // row.dtype.itemsize)
+
+
+def spread(number, row):  # type: ignore[no-untyped-def]
+    """The same number, of the type of those in `row`, in all lanes."""
+    return np.full(width(row), number, row.dtype)
+
+
+def load(row, first):  # type: ignore[no-untyped-def]
+    """row[first], row[first + 1], ...: so many numbers that they fill a vector. No bounds are looked at."""
+    return row[first : first + width(row)].copy()
+
+
+def store(row, first, lanes):  # type: ignore[no-untyped-def]
+    """row[first], row[first + 1], ... <- lanes."""
+    row[first : first + width(row)] = lanes
+
+
+def gather(row, nodes, first):  # type: ignore[no-untyped-def]
+    """row[nodes[first]], row[nodes[first + 1]], ...; nodes uint32, below 2^31."""
+    return row[nodes[first : first + width(row)]]
+
+
+def scatter(row, nodes, first, lanes):  # type: ignore[no-untyped-def]
+    """row[nodes[first]] += the first lane, and so on, in this order; nodes may be the same."""
+    for node, number in zip(nodes[first : first + width(row)], lanes, strict=True):
+        row[node] += number
+
+
+def prefetch(batch):  # type: ignore[no-untyped-def]
+    """Ask for an array of two dimensions before it is needed."""
+
+
+def first_of(n, lanes, others):  # type: ignore[no-untyped-def]
+    """The first n of the lanes, and the others behind them."""
+    return np.where(np.arange(len(lanes)) < n, lanes, others)
+
+
+def shift(before, lanes):  # type: ignore[no-untyped-def]
+    """The last lane of the vector before, and all of this but the last."""
+    return np.concatenate([before[-1:], lanes[:-1]])
+
+
+def last(lanes):  # type: ignore[no-untyped-def]
+    """The number in the last lane."""
+    return lanes[-1]
+
+
+def smaller(a, b):  # type: ignore[no-untyped-def]
+    """The smaller of two numbers in each lane; the first where either is no number."""
+    return np.where(b < a, b, a)
+
+
+def smallest(lanes):  # type: ignore[no-untyped-def]
+    """The smallest number of all lanes."""
+    return lanes.min()
+
+
+def magnitude(lanes):  # type: ignore[no-untyped-def]
+    """Absolute values."""
+    return abs(lanes)
+
+
+def root(lanes):  # type: ignore[no-untyped-def]
+    """Square roots."""
+    return np.sqrt(lanes)
+
+
+# ---------------------------------------------------------------- and what they become
+
+_Lower = Callable[[Any, Any, Any, Any], Any]
+_I32, _I64 = ir.IntType(32), ir.IntType(64)
+
+
+def _typed(function: Any, result: Callable[..., types.Type | None]) -> None:
+    """Tell numba the type of a call from those of its arguments; None if it is none of ours."""
+
+    class Template(AbstractTemplate):
+        def generic(self, arguments: Any, keywords: Any) -> Any:
+            made = result(*arguments)
+            return None if made is None else signature(made, *arguments)
+
+    infer_global(function)(Template)
+
+
+def _in_lanes(builder: Any, number: Any, lanes: Any) -> Any:
+    """A number in all lanes of an LLVM vector type."""
+    single = builder.insert_element(ir.Constant(lanes, ir.Undefined), number, ir.Constant(_I32, 0))
+    order = ir.Constant(ir.VectorType(_I32, lanes.count), [0] * lanes.count)
+    return builder.shuffle_vector(single, ir.Constant(lanes, ir.Undefined), order)
+
+
+def _arithmetic(function: Any, instruction: str) -> None:
+    """An operator on two vectors, or on one and a number of the same type."""
+
+    def result(a: types.Type, b: types.Type) -> types.Type | None:
+        if isinstance(a, Lanes):
+            return a if b in (a, a.dtype) else None
+        return b if isinstance(b, Lanes) and a == b.dtype else None
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        lanes = context.get_value_type(sig.return_type)
+        a, b = (
+            x if isinstance(t, Lanes) else _in_lanes(builder, x, lanes) for x, t in zip(args, sig.args, strict=True)
+        )
+        return getattr(builder, instruction)(a, b, flags=_FLAGS)
+
+    _typed(function, result)
+    for pair in ((Lanes, Lanes), (Lanes, types.Float), (types.Float, Lanes)):
+        lower_builtin(function, *pair)(lower)
+
+
+for _function, _instruction in (
+    (operator.add, "fadd"),
+    (operator.sub, "fsub"),
+    (operator.mul, "fmul"),
+    (operator.truediv, "fdiv"),
+):
+    _arithmetic(_function, _instruction)
+
+
+def _of(row: types.Type) -> Lanes | None:
+    """The vectors that an array without gaps is made of."""
+    if isinstance(row, types.Array) and isinstance(row.dtype, types.Float) and row.layout == "C":
+        return Lanes(row.dtype)
+    return None
+
+
+_typed(width, lambda row: types.uint64 if _of(row) else None)
+_typed(spread, lambda number, row: _of(row))
+_typed(load, lambda row, first: _of(row))
+_typed(store, lambda row, first, lanes: types.none if lanes == _of(row) else None)
+_typed(gather, lambda row, nodes, first: _of(row))
+_typed(scatter, lambda row, nodes, first, lanes: types.none if lanes == _of(row) else None)
+_typed(prefetch, lambda batch: types.none if isinstance(batch, types.Array) else None)
+_typed(first_of, lambda n, lanes, others: lanes if lanes == others and isinstance(lanes, Lanes) else None)
+_typed(shift, lambda before, lanes: lanes if before == lanes and isinstance(lanes, Lanes) else None)
+_typed(last, lambda lanes: lanes.dtype if isinstance(lanes, Lanes) else None)
+_typed(smaller, lambda a, b: a if a == b and isinstance(a, Lanes) else None)
+_typed(smallest, lambda lanes: lanes.dtype if isinstance(lanes, Lanes) else None)
+_typed(magnitude, lambda lanes: lanes if isinstance(lanes, Lanes) else None)
+_typed(root, lambda lanes: lanes if isinstance(lanes, Lanes) else None)
+
+
+def _pointer(context: Any, builder: Any, row_type: Any, row: Any, first: Any) -> Any:
+    """Where the element `first` of an array is."""
+    data = context.make_array(row_type)(context, builder, row).data
+    return builder.gep(data, [first])
+
+
+def _vector_pointer(context: Any, builder: Any, row_type: Any, row: Any, first: Any, width: int) -> tuple[Any, int]:
+    """As `_pointer`, of a vector of its elements, and their alignment."""
+    element = context.get_data_type(row_type.dtype)
+    place = _pointer(context, builder, row_type, row, first)
+    return builder.bitcast(place, ir.VectorType(element, width).as_pointer()), row_type.dtype.bitwidth // 8
+
+
+@lower_builtin(width, types.Array)
+def _width(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    return ir.Constant(_I64, Lanes(sig.args[0].dtype).width)
+
+
+@lower_builtin(spread, types.Float, types.Array)
+def _spread(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    number = context.cast(builder, args[0], sig.args[0], sig.return_type.dtype)
+    return _in_lanes(builder, number, context.get_value_type(sig.return_type))
+
+
+@lower_builtin(load, types.Array, types.Integer)
+def _load(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    place, align = _vector_pointer(context, builder, sig.args[0], args[0], args[1], sig.return_type.width)
+    return builder.load(place, align=align)
+
+
+@lower_builtin(store, types.Array, types.Integer, Lanes)
+def _store(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    place, align = _vector_pointer(context, builder, sig.args[0], args[0], args[1], sig.args[2].width)
+    builder.store(args[2], place, align=align)
+    return context.get_dummy_value()
+
+
+@lower_builtin(gather, types.Array, types.Array, types.Integer)
+def _gather(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    n = sig.return_type.width
+    vector = context.get_value_type(sig.return_type)
+    many = ir.VectorType(_I64, n)
+    place, align = _vector_pointer(context, builder, sig.args[1], args[1], args[2], n)
+    nodes = builder.sext(builder.load(place, align=align), many)
+    base = builder.ptrtoint(context.make_array(sig.args[0])(context, builder, args[0]).data, _I64)
+    size = ir.Constant(_I64, sig.return_type.dtype.bitwidth // 8)
+    places = builder.add(_in_lanes(builder, base, many), builder.mul(nodes, _in_lanes(builder, size, many)))
+    pointers = builder.inttoptr(places, ir.VectorType(vector.element.as_pointer(), n))
+    mask = ir.VectorType(ir.IntType(1), n)
+    name = f"llvm.masked.gather.v{n}f{sig.return_type.dtype.bitwidth}.v{n}p0"
+    kind = ir.FunctionType(vector, [pointers.type, _I32, mask, vector])
+    call = cgutils.get_or_insert_function(builder.module, kind, name)
+    every = ir.Constant(mask, [ir.Constant(ir.IntType(1), 1)] * n)
+    align = ir.Constant(_I32, sig.return_type.dtype.bitwidth // 8)
+    return builder.call(call, [pointers, align, every, ir.Constant(vector, ir.Undefined)])
+
+
+@lower_builtin(scatter, types.Array, types.Array, types.Integer, Lanes)
+def _scatter(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    for lane in range(sig.args[3].width):
+        which = builder.add(args[2], ir.Constant(args[2].type, lane))
+        node = builder.load(_pointer(context, builder, sig.args[1], args[1], which))
+        place = _pointer(context, builder, sig.args[0], args[0], builder.zext(node, _I64))
+        number = builder.extract_element(args[3], ir.Constant(_I32, lane))
+        builder.store(builder.fadd(builder.load(place), number), place)
+    return context.get_dummy_value()
+
+
+@lower_builtin(prefetch, types.Array)
+def _prefetch(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    array = context.make_array(sig.args[0])(context, builder, args[0])
+    n = builder.mul(array.nitems, array.itemsize)
+    byte = ir.IntType(8).as_pointer()
+    data = builder.bitcast(array.data, byte)
+    kind = ir.FunctionType(ir.VoidType(), [byte, _I32, _I32, _I32])
+    call = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+    with cgutils.for_range_slice(builder, ir.Constant(n.type, 0), n, ir.Constant(n.type, 64)) as (at, _):
+        hints = [ir.Constant(_I32, value) for value in (0, 3, 1)]
+        builder.call(call, [builder.gep(data, [at]), *hints])
+    return context.get_dummy_value()
+
+
+@lower_builtin(first_of, types.Integer, Lanes, Lanes)
+def _first_of(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    n = sig.return_type.width
+    numbers = ir.VectorType(_I64, n)
+    places = ir.Constant(numbers, list(range(n)))
+    chosen = builder.icmp_unsigned("<", places, _in_lanes(builder, args[0], numbers))
+    return builder.select(chosen, args[1], args[2])
+
+
+@lower_builtin(shift, Lanes, Lanes)
+def _shift(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    n = sig.return_type.width
+    order = ir.Constant(ir.VectorType(_I32, n), [n - 1 + lane for lane in range(n)])
+    return builder.shuffle_vector(args[0], args[1], order)
+
+
+@lower_builtin(last, Lanes)
+def _last(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    return builder.extract_element(args[0], ir.Constant(_I32, sig.args[0].width - 1))
+
+
+@lower_builtin(smaller, Lanes, Lanes)
+def _smaller(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    return builder.select(builder.fcmp_ordered("<", args[1], args[0]), args[1], args[0])
+
+
+@lower_builtin(smallest, Lanes)
+def _smallest(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    found = builder.extract_element(args[0], ir.Constant(_I32, 0))
+    for lane in range(1, sig.args[0].width):
+        number = builder.extract_element(args[0], ir.Constant(_I32, lane))
+        found = builder.select(builder.fcmp_ordered("<", number, found), number, found)
+    return found
+
+
+def _unary(name: str) -> _Lower:
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        vector = context.get_value_type(sig.return_type)
+        kind = ir.FunctionType(vector, [vector])
+        full = f"llvm.{name}.v{sig.return_type.width}f{sig.return_type.dtype.bitwidth}"
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, full), args)
+
+    return lower
+
+
+lower_builtin(magnitude, Lanes)(_unary("fabs"))
+lower_builtin(root, Lanes)(_unary("sqrt"))

@@ -1,0 +1,291 @@
+"""Kernels of nodes: the central-difference update and relaxation, masses, work and energy, packing."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numba import uint64 as U
+
+from mpitled.solver.kernels.stress import cofactor, inline, kernel
+
+
+@njit(cache=True)
+def follow(path, full, turns, amplitude):  # type: ignore[no-untyped-def]
+    """Displacements (n,), m, of dofs at that share of the load on the arcs of `loading.turn`; exact at full load."""
+    for p in range(path.size):
+        angle, arm, across = turns[p, 0], turns[p, 1], turns[p, 2]
+        arc = (np.cos(amplitude * angle) - 1) * arm + np.sin(amplitude * angle) * across
+        end = (np.cos(angle) - 1) * arm + np.sin(angle) * across
+        path[p] = amplitude * (full[p] - end) + arc
+
+
+@kernel
+def react(u, u_prev, f, mass, dofs, full, amplitude, reaction, time_step):  # type: ignore[no-untyped-def]
+    """Work (J) of the reactions at moving dofs over the last step, by the trapezoidal rule; renews the reactions.
+
+    A reaction is f + m a, a being the central difference to the place that the dof is moved to next (4.2.1: the
+    displaced nodes take u_max d(t + dt)); where mass is None prescribed dofs have none. dofs, full (n,): 3 node +
+    direction and metres at full load.
+    """
+    work = 0.0
+    for p in range(dofs.size):
+        node = dofs[p] // 3
+        c = dofs[p] % 3
+        now = u[c, node]
+        before = u_prev[c, node]
+        r = f[c, node]
+        if mass is not None:
+            r += mass[node] * (amplitude * full[p] - 2 * now + before) / (time_step * time_step)
+        work += 0.5 * (r + reaction[p]) * (now - before)
+        reaction[p] = r
+    return work
+
+
+@inline
+def _prescribe(u, fixed, dofs, full, amplitude, copied):  # type: ignore[no-untyped-def]
+    for p in range(fixed.size):
+        u[fixed[p] % 3, fixed[p] // 3] = 0
+        if copied is not None:
+            copied[fixed[p] % 3, fixed[p] // 3] = 0
+    for p in range(dofs.size):
+        u[dofs[p] % 3, dofs[p] // 3] = amplitude * full[p]
+        if copied is not None:
+            copied[dofs[p] % 3, dofs[p] // 3] = amplitude * full[p]
+
+
+@kernel
+def update(u, u_prev, f, mobility, fixed, dofs, full, amplitude, copied):  # type: ignore[no-untyped-def]
+    """The central difference (eq. 3.3, with the square on dt that 3.2 lacks), then the prescribed dofs; clears f.
+
+    mobility (n_nodes,) is dt^2 / m, s^2/kg. The new displacements overwrite u_prev: the caller swaps the two.
+    fixed (n,) are the dofs that stay, dofs and full (m,) those that move. copied, if given, takes the new displacements
+    in its own precision: a slow ramp's accelerations would be lost in displacements of single precision.
+    """
+    for c in range(3):
+        now = u[c]
+        before = u_prev[c]
+        fc = f[c]
+        for n in range(U(mobility.size)):
+            after = (now[n] - before[n]) + now[n] - mobility[n] * fc[n]
+            before[n] = after
+            fc[n] = 0
+            if copied is not None:
+                copied[c, n] = after
+    _prescribe(u_prev, fixed, dofs, full, amplitude, copied)
+
+
+@kernel
+def relax(u, u_prev, f, mobility, counted, fixed, dofs, full, amplitude, retain, gain, copied):  # type: ignore[no-untyped-def]
+    """As `update`, with a mobility tensor at each node (6, n_nodes: xx, xy, xz, yy, yz, zz) and damping.
+
+    u+ = u + retain (u - u_prev) - gain mobility f: with damping c per step, (2 - c) / (2 + c) and 2 / (2 + c).
+    Returns the work (J) of the internal forces where counted (3, n_nodes) is 1 and not 0, at free dofs that the rank
+    owns: each force times the mean of the steps before and after it.
+    """
+    half = 0.5
+    work = 0.0
+    for n in range(U(counted.shape[1])):
+        fx = f[0, n]
+        fy = f[1, n]
+        fz = f[2, n]
+        x = u[0, n] + retain * (u[0, n] - u_prev[0, n])
+        y = u[1, n] + retain * (u[1, n] - u_prev[1, n])
+        z = u[2, n] + retain * (u[2, n] - u_prev[2, n])
+        x -= gain * (mobility[0, n] * fx + mobility[1, n] * fy + mobility[2, n] * fz)
+        y -= gain * (mobility[1, n] * fx + mobility[3, n] * fy + mobility[4, n] * fz)
+        z -= gain * (mobility[2, n] * fx + mobility[4, n] * fy + mobility[5, n] * fz)
+        work += half * (
+            counted[0, n] * fx * (x - u_prev[0, n])
+            + counted[1, n] * fy * (y - u_prev[1, n])
+            + counted[2, n] * fz * (z - u_prev[2, n])
+        )
+        u_prev[0, n] = x
+        u_prev[1, n] = y
+        u_prev[2, n] = z
+        f[0, n] = 0
+        f[1, n] = 0
+        f[2, n] = 0
+        if copied is not None:
+            copied[0, n] = x
+            copied[1, n] = y
+            copied[2, n] = z
+    _prescribe(u_prev, fixed, dofs, full, amplitude, copied)
+    return work
+
+
+@njit(cache=True)
+def change_step(u, u_prev, f, mobility, ratio):  # type: ignore[no-untyped-def]
+    """Rewrites u_prev so that `update` with the new step's mobility takes a step `ratio` times as long as the last.
+
+    That is u+ = u + r (u - u_prev) - (1 + 1 / r) / 2 mobility f, the central difference with a variable step.
+    """
+    gain = 0.5 * (1 + 1 / ratio)
+    for c in range(3):
+        for n in range(mobility.size):
+            now = u[c, n]
+            u_prev[c, n] = now - ratio * (now - u_prev[c, n]) + (gain - 1) * mobility[n] * f[c, n]
+
+
+@kernel
+def kinetic_energy(u, u_prev, f, mass, mobility, counted, held, time_step):  # type: ignore[no-untyped-def]
+    """Kinetic energy (J) of the counted nodes at the middle of the two half steps around u.
+
+    held (n,) are the prescribed dofs: theirs is taken from the last half step, for f does not move them.
+    """
+    half = u.dtype.type(0.5)
+    twice = 0.0
+    for c in range(3):
+        now = u[c]
+        before = u_prev[c]
+        fc = f[c]
+        for n in range(U(mass.size)):
+            v = now[n] - before[n] - half * mobility[n] * fc[n]
+            twice += counted[n] * mass[n] * v * v
+    for p in range(held.size):
+        n = held[p] // 3
+        c = held[p] % 3
+        v = u[c, n] - u_prev[c, n]
+        w = v - half * mobility[n] * f[c, n]
+        twice += counted[n] * mass[n] * (v * v - w * w)
+    return 0.5 * twice / (time_step * time_step)
+
+
+@njit(cache=True)
+def raise_mass(u, u_prev, mass, mobility, required, counted, time_step):  # type: ignore[no-untyped-def]
+    """Raise each node's mass to what is required; added mass (kg, times 3 directions not counted) and energy (J).
+
+    The nodes go on at their speed, so that 1/2 dm v^2 comes into the system: a line of the ledger of its own.
+    """
+    added = 0.0
+    energy = 0.0
+    for n in range(required.size):
+        dm = required[n] - mass[n]
+        if dm > 0:
+            mass[n] = required[n]
+            mobility[n] = time_step * time_step / required[n]
+            if counted[n]:
+                added += dm
+                for c in range(3):
+                    v = (u[c, n] - u_prev[c, n]) / time_step
+                    energy += 0.5 * dm * v * v
+    return added, energy
+
+
+@njit(cache=True)
+def renew_tensors(mass, required, mobility, free, keep):  # type: ignore[no-untyped-def]
+    """mass (6, n) <- required (6, n), mobility (6, n) <- its inverse, of free dofs alone; nothing at prescribed ones.
+
+    free (3, n) is 1 at free dofs and 0 at prescribed ones. A mass that would fall below `keep` of what it was is scaled
+    up to that: cells that swing stiffen again before the next survey.
+    """
+    for n in range(required.shape[1]):
+        x = free[0, n]
+        y = free[1, n]
+        z = free[2, n]
+        r = required[:, n]
+        xx = r[0] * x
+        xy = r[1] * x * y
+        xz = r[2] * x * z
+        yy = r[3] * y
+        yz = r[4] * y * z
+        zz = r[5] * z
+        trace = xx + yy + zz
+        least = keep * (mass[0, n] + mass[3, n] + mass[5, n])
+        s = least / trace if 0 < trace < least else 1.0
+        mass[0, n] = s * xx
+        mass[1, n] = s * xy
+        mass[2, n] = s * xz
+        mass[3, n] = s * yy
+        mass[4, n] = s * yz
+        mass[5, n] = s * zz
+        # Prescribed dofs take part in the inverse as ones.
+        xx = mass[0, n] + 1 - x
+        yy = mass[3, n] + 1 - y
+        zz = mass[5, n] + 1 - z
+        k0, k1, k2, _, k4, k5, _, _, k8, determinant = cofactor(
+            xx, mass[1, n], mass[2, n], mass[1, n], yy, mass[4, n], mass[2, n], mass[4, n], zz
+        )
+        mobility[0, n] = x * k0 / determinant
+        mobility[1, n] = x * y * k1 / determinant
+        mobility[2, n] = x * z * k2 / determinant
+        mobility[3, n] = y * k4 / determinant
+        mobility[4, n] = y * z * k5 / determinant
+        mobility[5, n] = z * k8 / determinant
+
+
+@njit(cache=True)
+def watch_relaxation(u, u_prev, f, mass, mobility, counted, u_then, f_then):  # type: ignore[no-untyped-def]
+    """What relaxation has to know, of dofs where counted (3, n) is 1; renews u_then and f_then (3, n).
+
+    Kinetic energy; the forces' work in the half step to the present (`relax` counts it with the next step); numerator
+    and denominator of Rayleigh's quotient of the change since then, du . df / du . M du; the largest change in the last
+    step, m; the largest M^-1 f, m (time counts in steps).
+    """
+    kinetic = 0.0
+    work = 0.0
+    numerator = 0.0
+    denominator = 0.0
+    change = 0.0
+    residual = 0.0
+    for n in range(counted.shape[1]):
+        x = counted[0, n]
+        y = counted[1, n]
+        z = counted[2, n]
+        m = mass[:, n]
+        vx = x * (u[0, n] - u_prev[0, n])
+        vy = y * (u[1, n] - u_prev[1, n])
+        vz = z * (u[2, n] - u_prev[2, n])
+        dx = x * (u[0, n] - u_then[0, n])
+        dy = y * (u[1, n] - u_then[1, n])
+        dz = z * (u[2, n] - u_then[2, n])
+        fx = x * f[0, n]
+        fy = y * f[1, n]
+        fz = z * f[2, n]
+        kinetic += 0.5 * (
+            m[0] * vx * vx + m[3] * vy * vy + m[5] * vz * vz
+            + 2 * (m[1] * vx * vy + m[2] * vx * vz + m[4] * vy * vz)
+        )  # fmt: skip
+        work += 0.5 * (fx * vx + fy * vy + fz * vz)
+        numerator += dx * (fx - f_then[0, n]) + dy * (fy - f_then[1, n]) + dz * (fz - f_then[2, n])
+        denominator += (
+            m[0] * dx * dx + m[3] * dy * dy + m[5] * dz * dz
+            + 2 * (m[1] * dx * dy + m[2] * dx * dz + m[4] * dy * dz)
+        )  # fmt: skip
+        change = max(change, vx * vx + vy * vy + vz * vz)
+        m = mobility[:, n]
+        ax = m[0] * fx + m[1] * fy + m[2] * fz
+        ay = m[1] * fx + m[3] * fy + m[4] * fz
+        az = m[2] * fx + m[4] * fy + m[5] * fz
+        residual = max(residual, ax * ax + ay * ay + az * az)
+        u_then[0, n] = u[0, n]
+        u_then[1, n] = u[1, n]
+        u_then[2, n] = u[2, n]
+        f_then[0, n] = fx
+        f_then[1, n] = fy
+        f_then[2, n] = fz
+    return kinetic, work, numerator, denominator, np.sqrt(change), np.sqrt(residual)
+
+
+@kernel
+def pack(values, nodes, buffer):  # type: ignore[no-untyped-def]
+    """buffer (k, n) <- values (k, :) at the nodes (n,)."""
+    for c in range(values.shape[0]):
+        for i in range(U(nodes.size)):
+            buffer[c, i] = values[c, nodes[i]]
+
+
+@kernel
+def clear(values, nodes):  # type: ignore[no-untyped-def]
+    """values (k, :) <- 0 at the nodes (n,)."""
+    zero = values.dtype.type(0)
+    for c in range(values.shape[0]):
+        for i in range(U(nodes.size)):
+            values[c, nodes[i]] = zero
+
+
+@kernel
+def unpack(values, nodes, buffer):  # type: ignore[no-untyped-def]
+    """values (k, :) += buffer (k, n) at the nodes (n,)."""
+    for c in range(values.shape[0]):
+        for i in range(U(nodes.size)):
+            values[c, nodes[i]] += buffer[c, i]
