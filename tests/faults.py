@@ -56,6 +56,7 @@ nodes = "x0"
 nodes = "x1"
 displacement = [4.0, 0.0, 0.0]
 [solver]
+method = "quasi-static"
 load_time = 1.5
 [output]
 frames = 12

@@ -103,7 +103,7 @@ WRONG = [
     (FULL, "tumour.seed_radius", 5.1, None),
     (FULL, "cloud.radius", 2.0, "lies within the seed; give more than tumour.seed_radius = 2 mm"),
     (FULL, "cloud.seed", -1, "an integer at least 0 (default 0)"),
-    (FULL, "support.nodes", 3, "an integer at least 4 (default 12)"),
+    (FULL, "support.nodes", 3, "an integer at least 4 (default 20)"),
     (FULL, "support.min_domains", 0, "at least 1"),
     (FULL, "block.cloud", "none", 'leaves a tumour no cloud to grow in; give "core" or "all"'),
     (FULL, "solver.time_step", 0.0, '"auto" or a number above 0, in s (default "auto")'),
@@ -185,7 +185,7 @@ def test_keys_that_clash_are_both_named(folder):
     assert "tumour.seed_radius" in message
     message = complaint(write(folder, changed(BLOCK, "material.csf", BLOCK["material"]["brain"])))
     assert 'material.csf.cells = ["all"]: all is filled by material.brain already' in message
-    message = complaint(write(folder, changed(BLOCK, "support.basis", 20)))  # n < m
+    message = complaint(write(folder, changed(changed(BLOCK, "support.nodes", 12), "support.basis", 20)))
     assert "support.nodes = 12: is fewer than the 20 monomials of support.basis" in message
 
 
@@ -453,7 +453,7 @@ def others(value):
     if isinstance(value, float):
         return [value * 0.999 + 1e-3]
     if isinstance(value, str):
-        return [word for word in WORDS if word != value] + [1e-3]
+        return [word for word in WORDS if word != value] + [1e-3, 3]
     return [[other, *value[1:]] for other in others(value[0])] + [value[:-1], value[::-1]]
 
 

@@ -52,6 +52,7 @@ rotation = 3.0
 axis = "x"
 centre = [0.0, 20.0, 20.0]
 [solver]
+method = "quasi-static"
 load_time = 0.1
 [output]
 frames = 2

@@ -35,6 +35,7 @@ nodes = "bottom"
 nodes = "top"
 displacement = [0.0, 0.0, -30.0]
 [solver]
+method = "quasi-static"
 load_time = 0.02
 [output]
 frames = 10

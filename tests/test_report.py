@@ -39,6 +39,7 @@ poissons_ratio = 0.49
 [[fixed]]
 nodes = "surface"
 [solver]
+method = "quasi-static"
 load_time = 0.1
 [output]
 frames = 2
@@ -58,6 +59,7 @@ nodes = "z0"
 nodes = "z1"
 displacement = [6.0, 0.0, 0.0]
 [solver]
+method = "quasi-static"
 load_time = 2.0
 [output]
 frames = 1

@@ -40,6 +40,7 @@ rotation = {degrees}
 axis = "x"
 centre = [0.0, 12.0, 12.0]
 [solver]
+method = "quasi-static"
 load_time = 0.2
 {solver}
 [output]

@@ -44,6 +44,7 @@ nodes = "x1"
 directions = ["x"]
 displacement = [{millimetres}]
 [solver]
+method = "quasi-static"
 load_time = {load_time}
 [output]
 frames = 2
@@ -66,6 +67,7 @@ poissons_ratio = 0.49
 [[fixed]]
 nodes = "surface"
 [solver]
+method = "quasi-static"
 load_time = 0.3
 [output]
 frames = 2

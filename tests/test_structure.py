@@ -109,6 +109,7 @@ nodes = "x0"
 nodes = "x1"
 displacement = [0.1, 0.0, 0.0]
 [solver]
+method = "quasi-static"
 load_time = 1.0
 [output]
 frames = 1

@@ -220,6 +220,7 @@ poissons_ratio = 0.49
 [[fixed]]
 nodes = "surface"
 [solver]
+method = "quasi-static"
 load_time = 0.5
 [output]
 pictures = false
