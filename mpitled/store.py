@@ -683,6 +683,21 @@ _VTK_VERTEX, _VTK_HEXAHEDRON = 1, 12
 _HEXAHEDRON, _EFG_NODE, _INTEGRATION_POINT = 0, 1, 2
 
 
+#: Bytes in a result of the mesh and of each frame: of a point (place, two numbers; two displacements), of a cell (offset,
+#: type, number, material, kind, part; J), and of a corner of a cell.
+_POINT_BYTES, _CELL_BYTES, _CORNER_BYTES = (24 + 16, 48), (8 + 1 + 8 + 2 + 1 + 4, 8), 8
+#: Of the tables of steps for each frame; and of the deck, and HDF5's own.
+_FRAME_BYTES, _ON_TOP = 450, 1 << 15
+
+
+def result_bytes(n_nodes: int, n_efg_nodes: int, n_hexahedra: int, n_domains: int, n_frames: int) -> int:
+    """Size of result.vtkhdf with so many frames, to 32 KiB: see `ResultWriter` for what its points and cells are."""
+    n_points, n_vertices = n_nodes + n_domains, n_efg_nodes + n_domains
+    size = sum(_POINT_BYTES[k] * n_points * n for k, n in enumerate((1, n_frames)))
+    size += sum(_CELL_BYTES[k] * (n_hexahedra + n_vertices) * n for k, n in enumerate((1, n_frames)))
+    return size + _CORNER_BYTES * (8 * n_hexahedra + n_vertices) + _FRAME_BYTES * n_frames + _ON_TOP
+
+
 class ResultWriter:
     """Writes `result.vtkhdf`: a VTKHDF unstructured grid with steps, one piece for the whole mesh, in parallel.
 
