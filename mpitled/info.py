@@ -51,8 +51,6 @@ def contents(path: Path) -> dict[str, Any]:
 
     InputError if it is none of these, or damaged.
     """
-    from mpitled import store
-
     if path.is_dir():
         raise InputError(f"{path}: is a folder; give a file in it, model.h5 or result.vtkhdf")
     with damaged(path, "build the model anew, or run the deck again"):

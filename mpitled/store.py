@@ -683,16 +683,17 @@ _VTK_VERTEX, _VTK_HEXAHEDRON = 1, 12
 _HEXAHEDRON, _EFG_NODE, _INTEGRATION_POINT = 0, 1, 2
 
 
-#: Bytes in a result of the mesh and of each frame: of a point (place, two numbers; two displacements), of a cell (offset,
-#: type, number, material, kind, part; J), and of a corner of a cell.
+#: Bytes in a result, of the mesh and of each frame: of a point (place, two numbers; two displacements), of a cell
+#: (offset, type, number, material, kind, part; J), and of a corner of a cell.
 _POINT_BYTES, _CELL_BYTES, _CORNER_BYTES = (24 + 16, 48), (8 + 1 + 8 + 2 + 1 + 4, 8), 8
 #: Of the tables of steps for each frame; and of the deck, and HDF5's own.
-_FRAME_BYTES, _ON_TOP = 450, 1 << 15
+_FRAME_BYTES, _ON_TOP = 505, 40_000
 
 
-def result_bytes(n_nodes: int, n_efg_nodes: int, n_hexahedra: int, n_domains: int, n_frames: int) -> int:
-    """Size of result.vtkhdf with so many frames, to 32 KiB: see `ResultWriter` for what its points and cells are."""
-    n_points, n_vertices = n_nodes + n_domains, n_efg_nodes + n_domains
+def result_bytes(rows: PartRows, n_frames: int) -> int:
+    """Size of the whole model's result.vtkhdf with so many frames, to some kilobytes; see `ResultWriter`."""
+    n_hexahedra, n_vertices = rows.n_hexahedra, rows.n_nodes - rows.n_fe_nodes + rows.n_domains
+    n_points = rows.n_nodes + rows.n_domains
     size = sum(_POINT_BYTES[k] * n_points * n for k, n in enumerate((1, n_frames)))
     size += sum(_CELL_BYTES[k] * (n_hexahedra + n_vertices) * n for k, n in enumerate((1, n_frames)))
     return size + _CORNER_BYTES * (8 * n_hexahedra + n_vertices) + _FRAME_BYTES * n_frames + _ON_TOP
@@ -1208,6 +1209,12 @@ def _ascending(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
     """Rows of the numbers from 0 on, in their order; -1 is no number."""
     rows = np.flatnonzero(numbers >= 0)
     return rows[np.argsort(numbers[rows])]
+
+
+def unfinished_bytes(directory: Path) -> int:
+    """Room that the unfinished results in a directory take, which a run there goes on with or writes anew."""
+    path = Path(directory) / _UNFINISHED
+    return path.stat().st_size if path.exists() else 0
 
 
 def is_unfinished(directory: Path) -> bool:
