@@ -26,8 +26,10 @@ import warnings
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from hostile import Reader, attempt, readers
+if TYPE_CHECKING:
+    from hostile import Reader
 
 ENGINES = ("random", "hypothesis", "atheris")
 LONGEST_S, MOST_BYTES = 20, 1 << 30
@@ -40,6 +42,8 @@ SHARES = {"deck, with the time it takes": 0.1, "decks of a mixed mesh": 0.2, "mo
 
 def work(reader: Reader, engine: str, first: int, count: int, report: int, folder: Path) -> None:
     """Try inputs number `first` and on; says of each to the descriptor `report` that it begins, and how it ended."""
+
+    from hostile import attempt
 
     def tell(word: str) -> None:
         os.write(report, word.encode() + b"\n")
@@ -55,8 +59,12 @@ def work(reader: Reader, engine: str, first: int, count: int, report: int, folde
         except (Exception, SystemExit):
             tell("crash")
             traceback.print_exc()
+        except BaseException:  # of hypothesis, which wants no more of this input
+            tell("over")
+            raise
         finally:
             signal.alarm(0)
+        tell(f"memory {_peak()}")
 
     numbers = iter(range(first, first + count))
     if engine == "random":
@@ -91,7 +99,6 @@ def work(reader: Reader, engine: str, first: int, count: int, report: int, folde
             def getrandbits(self, k: int) -> int:
                 return int.from_bytes(self._data.ConsumeBytes(-(-k // 8)), "little") & ((1 << k) - 1)
 
-        atheris.instrument_all()
         arguments = [
             sys.argv[0],
             f"-runs={count}",
@@ -104,6 +111,15 @@ def work(reader: Reader, engine: str, first: int, count: int, report: int, folde
         atheris.Fuzz()
 
 
+def _instrumented(engine: str) -> contextlib.AbstractContextManager[object]:
+    """Imports that tell atheris where the program goes."""
+    if engine != "atheris":
+        return contextlib.nullcontext()
+    import atheris
+
+    return atheris.instrument_imports(include=["mpitled"])  # type: ignore[no-any-return]
+
+
 def _too_long(*_: object) -> None:
     raise TimeoutError(f"took more than {LONGEST_S} s")
 
@@ -112,7 +128,10 @@ def _worker(name: str, engine: str, first: int, count: int, scratch: Path) -> No
     report = os.dup(1)
     os.dup2(2, 1)  # what libraries print is for the log
     faulthandler.enable()
-    reader = readers(scratch)[name]
+    with _instrumented(engine):
+        from hostile import readers
+
+        reader = readers(scratch)[name]
     warnings.simplefilter("ignore", ResourceWarning)
     signal.signal(signal.SIGALRM, _too_long)
     most = MOST_BYTES + resource.getpagesize() * int(Path("/proc/self/statm").read_text().split()[0])
@@ -122,7 +141,6 @@ def _worker(name: str, engine: str, first: int, count: int, scratch: Path) -> No
         with contextlib.suppress(FileNotFoundError):
             Path("/proc/self/clear_refs").write_text("5")  # the largest memory from here on
         work(reader, engine, first, count, report, Path(folder))
-        os.write(report, f"memory {_peak()}\n".encode())
 
 
 def _peak() -> int:
@@ -168,8 +186,8 @@ def _follow(process: subprocess.Popen[bytes], ends: Counter[str]) -> bool:
                 ends["crash"] += at_work
                 return at_work or process.returncode not in (0, None)
             at_work = line[0] == "begin"
-            if at_work:
-                ends["tried"] += 1
+            if at_work or line[0] == "over":
+                ends["tried"] += 1 if at_work else -1
             elif line[0] == "memory":
                 ends["memory"] = max(ends["memory"], int(line[1]))
             else:
@@ -203,6 +221,8 @@ def main(words: Sequence[str] | None = None) -> int:
     if options.worker:
         _worker(options.worker, options.engine, options.first, options.of_worker, options.scratch)
         return 0
+    from hostile import readers
+
     rows: dict[str, Counter[str]] = {}
     scratch, begin = Path(tempfile.mkdtemp()), time.perf_counter()
     try:

@@ -14,11 +14,11 @@ from conftest import ENVIRONMENT, ROOT, mpitled, ranks
 from mpitled.store import open_result
 
 STEPS, FRAMES = 1_000_000, 50
-#: What the ledger may miss of the energy in the body: round-off of a million sums, at random, is a thousandth of this.
-DRIFT = 1e-9
+#: What the energy of the body may differ from the work done on it, at any time, as a share.
+DRIFT = 1e-3
 #: Growth of a rank's memory over the second half of the run, bytes: none, but for a page here and there.
 GROWTH = 1 << 18
-#: Stretched in the first thousandth of the run, and left to itself: it swings to the end, for nothing damps it.
+#: Stretched in 20 steps, half of its slowest period, and left to itself: it swings to the end, for nothing damps it.
 SCENE = """
 [block]
 size = [20.0, 20.0, 20.0]
@@ -53,7 +53,7 @@ def test_a_million_steps_on_two_ranks(tmp_path):
     step = 1e-3
     deck, out = tmp_path / "scene.toml", tmp_path / "out"
     end = STEPS * step
-    deck.write_text(SCENE.format(load=end / 1000, hold=end * 0.999, step=step, frames=FRAMES))
+    deck.write_text(SCENE.format(load=20 * step, hold=end - 20 * step, step=step, frames=FRAMES))
     told = mpitled("run", deck, "--dry", "--out", out, n=2).stdout
     print(told[told.index("steps:") :])
     # Ranks that wait give way: they may not have the machine for themselves.
@@ -81,9 +81,14 @@ def test_a_million_steps_on_two_ranks(tmp_path):
     with open_result(out) as result:
         assert result.complete
         assert result.figures["steps"] >= STEPS
-        held = result.times > 2 * end / 1000
-        total = sum(result.series[name] for name in ("strain", "hourglass", "stabilisation", "kinetic"))[held]
-        external = result.series["external"][held]
-        drift = np.abs(total - external).max() / np.abs(total).max()
-        print(f"{result.figures['steps']} steps in {seconds:.0f} s; energy {total[0]:.6e} J, drift {drift:.2e}")
-        assert drift < DRIFT
+        series = {name: values[1:] for name, values in result.series.items()}
+        total = sum(series[name] for name in ("strain", "hourglass", "stabilisation", "kinetic"))
+        off = total / series["external"] - 1
+        first, second = off[: FRAMES // 2].mean(), off[FRAMES // 2 :].mean()
+        kinetic = (series["kinetic"] / total).mean()
+        print(
+            f"{result.figures['steps']} steps in {seconds:.0f} s; {kinetic:.1%} of the energy is kinetic, in the mean"
+        )
+        print(f"energy is off by {np.abs(off).max():.1e} at most, {second - first:.1e} between the halves")
+        assert kinetic > 0.05  # it swings
+        assert np.abs(off).max() < DRIFT

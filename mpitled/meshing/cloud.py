@@ -114,7 +114,7 @@ def fill_void(
         _check_room(points[boundary], tumour, element_size)
 
     void = float(volumes_and_centroids(corners)[0].sum())
-    _check_size(void, spacing, cloud.points_per_spacing)
+    _check_size(corners, void, spacing, cloud.points_per_spacing)
     in_fe = np.zeros(len(points), bool)
     in_fe[hexahedra[~dropped]] = True
     on_boundary = np.zeros(len(points), bool)
@@ -315,10 +315,11 @@ def _seed(cloud: deck.Cloud, tumour: deck.Tumour | None, element_size: float) ->
     return centre + radius * on_sphere(n), Spacing(largest, cloud.growth, centre, radius, float(at_surface))
 
 
-def _check_size(void: float, spacing: Spacing, per_spacing: float) -> None:
-    """InputError if nodes and integration points for a void of that volume (m^3) are too many for the memory.
+def _check_size(corners: NDArray[np.float64], void: float, spacing: Spacing, per_spacing: float) -> None:
+    """InputError if nodes and integration points for cells (n, 8, 3) of that volume (m^3) are too many for the memory.
 
-    No more nodes fit than into a ball of that volume around the seed, where they are densest.
+    No more nodes fit than into a ball of that volume around the seed, where they are densest. Cells that are flat are
+    cut along their edges only, into more parts than their volume asks for.
     """
     if spacing.centre is None:
         nodes = void / spacing.largest**3
@@ -327,7 +328,8 @@ def _check_size(void: float, spacing: Spacing, per_spacing: float) -> None:
         r = np.geomspace(spacing.radius, reach, 1000)
         density = 4 * np.pi * r**2 / spacing.at_distance(r) ** 3
         nodes = float(((density[1:] + density[:-1]) / 2 * np.diff(r)).sum())
-    needed = nodes * (1 + per_spacing**3)
+    cuts = _edges(corners) * max(per_spacing, 1.0) / spacing(corners.mean(axis=1))[:, None]
+    needed = max(nodes * (1 + per_spacing**3), float(np.maximum(cuts, 1).prod(axis=1).sum()))
     what = f"cloud: makes about {needed:.3g} nodes and integration points, which"
     room.check_memory(_BYTES * needed, what, f"{_COARSER} by spacing, growth or points_per_spacing")
 
