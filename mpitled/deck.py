@@ -720,7 +720,8 @@ def _check(deck: Deck, source: _Source) -> None:
 
 def _check_tumour(deck: Deck, given: dict[str, Any], source: _Source) -> None:
     assert deck.tumour is not None
-    seed_volume = 4 / 3 * math.pi * given["tumour"]["seed_radius"] ** 3
+    radius = given["tumour"]["seed_radius"]
+    seed_volume = 4 / 3 * math.pi * radius * radius * radius  # a power of a slip raises OverflowError
     if given["tumour"]["volume"] < seed_volume:
         what = f"is less than the seed's {seed_volume:.4g} mm3; give more, or a smaller tumour.seed_radius"
         raise source.error("tumour.volume", what, given["tumour"]["volume"])

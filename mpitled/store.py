@@ -72,6 +72,8 @@ _MODEL_SHAPES: dict[str, tuple[str | int, ...]] = {
     "prescribed_turns": ("dofs", 3),
 }
 _REBUILD, _AGAIN = "build the model anew", "run the deck again"
+#: Numbers in SI units are smaller by far.
+_LARGEST = 1e50
 
 
 def hdf5_version() -> str:
@@ -123,6 +125,7 @@ def read_model(path: Path) -> Model:
             _read_sets(file["cell_sets"]),
             _read_materials(file),
         )
+        _check_finite(arrays)
         ends = {"hexahedra": n_nodes, "domains": n_nodes, "field_domains": n_domains, "material": len(materials)}
         for name, end in (ends | {"prescribed_dofs": 3 * n_nodes}).items():
             _check_numbers(arrays[name], end, name)
@@ -310,6 +313,13 @@ def _check_numbers(numbers: NDArray[np.integer], end: int, what: str) -> None:
     """ValueError unless all of them count something of which there are `end`."""
     if numbers.size and not 0 <= numbers.min() <= numbers.max() < end:
         raise ValueError(f"{what} has numbers beyond 0 to {end - 1}")
+
+
+def _check_finite(arrays: Mapping[str, NDArray[Any]]) -> None:
+    """ValueError unless all numbers are there, and small enough to be squared and multiplied."""
+    for name, values in arrays.items():
+        if values.dtype.kind == "f" and not (np.abs(values) < _LARGEST).all():
+            raise ValueError(f"{name} has numbers that are none, or beyond {_LARGEST:g}")
 
 
 def _check_ascending(numbers: NDArray[np.integer], what: str) -> None:
@@ -595,7 +605,7 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
             _check_numbers(numbers, n_nodes, name)
             if numbers.size and not (nodes.take(np.searchsorted(nodes, numbers), mode="clip") == numbers).all():
                 raise ValueError(f"{name} have nodes that their part has not")
-        return PartRows(
+        part_rows = PartRows(
             n_parts=n_parts,
             part=part,
             n_nodes=n_nodes,
@@ -628,6 +638,8 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
             shared=shared,
             shared_offsets=shared_offsets,
         )
+        _check_finite({f.name: v for f in fields(PartRows) if isinstance(v := getattr(part_rows, f.name), np.ndarray)})
+        return part_rows
 
 
 def read_rows(dataset: h5py.Dataset, rows: NDArray[np.int64]) -> NDArray[Any]:

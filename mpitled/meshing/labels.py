@@ -135,7 +135,7 @@ def label_cells(labels: deck.Labels) -> Head:
     voxels = {name: mask & body for name, mask in voxels.items() if name in _VENTRICLES}
 
     size = labels.element_size
-    n_cubes = body.sum() * image.voxel.prod() / size**3
+    n_cubes = float(body.sum() * (image.voxel / size).prod())
     check_size(n_cubes, f"labels.element_size = {1e3 * size:g} mm", "enlarge it")
     grid = _grid(image, body, size)
     shares = {name: box_shares(image, mask, grid) for name, mask in {"solid": body, **voxels}.items()}
