@@ -28,6 +28,8 @@ else:
 
 #: A deck is larger than that by mistake, and so is a key of so many parts, for which parsers take the square of time.
 _MOST_BYTES, _MOST_PARTS = 1 << 18, 100
+#: Smaller sizes, and numbers larger than its reciprocal, are slips: ratios and their cubes have to stay floats.
+_FINEST = 1e-30
 #: What is between the dots of a key, and what else there is in TOML.
 _TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"?|\'[^\'\n]*\'?|[\w-]+|[ \t]+|.', re.DOTALL)
 #: Units of the deck that are not SI: how many make one SI unit. Dividing by a power of ten rounds 5.1 mm to 0.0051 m.
@@ -566,6 +568,8 @@ def _convert(hint: Any, value: Any, limits: str) -> Any:
     if hint is float and type(value) in (int, float):
         if abs(value) > sys.float_info.max or math.isnan(value):
             raise ValueError("is not a finite number")
+        if abs(value) > 1 / _FINEST or (limits.startswith("(0") and 0 < value < _FINEST):
+            raise ValueError(f"is not between {_FINEST:g} and {1 / _FINEST:g}")
         return _within(float(value), limits)
     if hint is int and type(value) is int:
         if abs(value) >= 2**31:

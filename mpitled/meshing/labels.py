@@ -195,8 +195,10 @@ def read_image(path: Path) -> Image:
             f"{path}: its axes are oblique to the scanner's; resample it first, without interpolating the labels "
             "(nibabel.processing.resample_to_output, order=0)"
         )
-    units = getattr(image.header, "get_xyzt_units", lambda: ("mm",))()[0]
-    metre = _METRES[units]
+    try:
+        metre = _METRES[getattr(image.header, "get_xyzt_units", lambda: ("mm",))()[0]]
+    except KeyError:
+        raise InputError(f"{path}: its header has a unit of length that is none; correct it (mm)") from None
     return Image(
         path=path,
         labels=np.ascontiguousarray(data.T).astype(np.int32),
