@@ -264,7 +264,7 @@ def readers(scratch: Path) -> dict[str, Reader]:
     scenes = {name: {"scene.toml": text.encode()} for name, text in _SCENES.items()}
     numbers = np.random.default_rng(0).uniform(0, 0.02, (30, 6))
     table = "x,y,z,ux,uy,uz\n" + "".join(",".join(map(repr, row)) + "\n" for row in numbers.tolist())
-    run, model, result = _run(scratch)
+    run, model, result, kept = _run(scratch)
     unpack = {".gz": (gzip.decompress, gzip.compress), ".npz": _rezip(bytes)}
     sweep = {
         "deck": str(scratch / "run.toml"), "overrides": ["output.pictures=false"], "ranks": 1,
@@ -293,6 +293,7 @@ def readers(scratch: Path) -> dict[str, Reader]:
         "reference (CSV)": Reader(_reference(run), {"csv": {"r.csv": table.encode()}}),
         "reference (vtu)": Reader(_reference(run), {"vtu": {"r.vtu": _vtu(scratch)}}),
         "model.h5": Reader(_model, {"model": {"model.h5": model}}),
+        "checkpoint.h5": Reader(_checkpoint, {"checkpoint": {"checkpoint.h5": kept}}),
         "result.vtkhdf": Reader(_result, {"result": {"result.vtkhdf": result, "model.h5": model}}),
     }
 
@@ -353,6 +354,13 @@ def _model(path: Path) -> object:
     return march
 
 
+def _checkpoint(path: Path) -> object:
+    from mpitled import info, store
+
+    info.contents(path)
+    return store.checkpoint_contents(path), store.read_checkpoint(path, np.arange(50))
+
+
 def _result(path: Path) -> object:
     from mpitled import info
     from mpitled.results import field, report
@@ -366,8 +374,9 @@ def _result(path: Path) -> object:
 # --- whole files ---------------------------------------------------------------------------------------------------
 
 
-def _run(scratch: Path) -> tuple[Path, bytes, bytes]:
-    """A small run's folder, its model (partitioned in two) and its result."""
+def _run(scratch: Path) -> tuple[Path, bytes, bytes, bytes]:
+    """A small run's folder, its model (partitioned in two), its result, and a checkpoint."""
+    from mpitled import store
     from mpitled.deck import load_deck
     from mpitled.solver import run
     from mpitled.solver.halo import World
@@ -377,7 +386,12 @@ def _run(scratch: Path) -> tuple[Path, bytes, bytes]:
     if not (folder / "result.vtkhdf").exists():
         run.run(load_deck(deck, ("output.pictures=false", "solver.load_time=0.05")), folder, World(), quiet=True)
         run.ensure_partition(folder / run.MODEL, 2, 0)
-    return folder, (folder / run.MODEL).read_bytes(), (folder / "result.vtkhdf").read_bytes()
+        rows = store.read_part(folder / run.MODEL, 1, 0)
+        told = {"version": "0", "ranks": 1, "step": 3, "share": 0.1, "frames": 1}
+        store.write_checkpoint(scratch, None, rows, told, {"u": np.zeros((rows.n_nodes, 3))}, [0.5, 1.0])
+    files = (folder / run.MODEL, folder / "result.vtkhdf", scratch / store.CHECKPOINTS[0])
+    model, result, kept = (path.read_bytes() for path in files)
+    return folder, model, result, kept
 
 
 def _cubes() -> Any:

@@ -30,7 +30,10 @@ nodes = "x0"
 [[displaced]]
 nodes = "x1"
 displacement = [0.1, 0.0, 0.0]
+[support]
+nodes = 12
 [solver]
+method = "quasi-static"
 load_time = 0.1
 [output]
 frames = 1

@@ -12,8 +12,10 @@ from pathlib import Path
 import pytest
 from conftest import ENVIRONMENT, ROOT, mpitled, ranks
 
+from mpitled.deck import load_deck
 from mpitled.errors import InputError
-from mpitled.store import open_result
+from mpitled.solver import checkpoint
+from mpitled.store import CHECKPOINTS, model_key, open_result
 
 SCRIPT = Path(__file__).with_name("two_hosts.sh")
 #: All that the launcher's keep-alive, TCP's tries and the end of the ranks take, s.
@@ -23,6 +25,8 @@ SCENE = """
 size = [20.0, 20.0, 20.0]
 elements = [8, 7, 7]
 cloud = "core"
+[support]
+nodes = 12
 [material.brain]
 youngs_modulus = 3000.0
 poissons_ratio = 0.45
@@ -111,10 +115,16 @@ def test_a_run_over_tcp_has_the_bits_of_one_on_a_single_host(hosts, tmp_path):
 def test_a_cut_cable_ends_the_job_on_both_hosts(hosts, tmp_path):
     deck, out = tmp_path / "scene.toml", tmp_path / "out"
     deck.write_text(SCENE)
-    job = start(hosts, "run", deck, "--out", out, "--set", "solver.load_time=2000")
+    job = start(
+        hosts, "run", deck, "--out", out, "--set", "solver.load_time=2000", "--set", "output.checkpoint_minutes=0.01"
+    )
     begin = time.monotonic()
     try:
-        while frames(out) == 0 and job.poll() is None and time.monotonic() - begin < 60:
+        while (
+            not (frames(out) and (out / CHECKPOINTS[0]).exists())
+            and job.poll() is None
+            and time.monotonic() - begin < 60
+        ):
             time.sleep(0.1)
         assert job.poll() is None
         script("cut", hosts, check=True)
@@ -130,3 +140,8 @@ def test_a_cut_cable_ends_the_job_on_both_hosts(hosts, tmp_path):
     assert not at_work(hosts)
     assert frames(out) > 0
     assert not (out / "result.vtkhdf").exists()
+    # Whole, and of this run: a run with --resume goes on from it.
+    scene = load_deck(deck, ("solver.load_time=2000", "output.checkpoint_minutes=0.01"))
+    kept = checkpoint.find(out, scene, model_key(out / "model.h5") or "")
+    assert kept is not None
+    assert kept.told["step"] > 0

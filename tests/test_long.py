@@ -27,6 +27,8 @@ SCENE = """
 size = [20.0, 20.0, 20.0]
 elements = [5, 5, 5]
 cloud = "core"
+[support]
+nodes = 12
 [material.brain]
 youngs_modulus = 3000.0
 poissons_ratio = 0.3
