@@ -699,7 +699,7 @@ _HEXAHEDRON, _EFG_NODE, _INTEGRATION_POINT = 0, 1, 2
 #: (offset, type, number, material, kind, part; J), and of a corner of a cell.
 _POINT_BYTES, _CELL_BYTES, _CORNER_BYTES = (24 + 16, 48), (8 + 1 + 8 + 2 + 1 + 4, 8), 8
 #: Of the tables of steps for each frame; and of the deck, and HDF5's own.
-_FRAME_BYTES, _ON_TOP = 505, 40_000
+_FRAME_BYTES, _ON_TOP = 537, 47_800
 
 
 def result_bytes(rows: PartRows, n_frames: int) -> int:

@@ -267,7 +267,7 @@ def readers(scratch: Path) -> dict[str, Reader]:
     run, model, result, kept = _run(scratch)
     unpack = {".gz": (gzip.decompress, gzip.compress), ".npz": _rezip(bytes)}
     sweep = {
-        "deck": str(scratch / "run.toml"), "overrides": ["output.pictures=false"], "ranks": 1,
+        "deck": str(scratch / "run.toml"), "overrides": ["output.pictures=false"], "ranks": 1, "one_growth": False,
         "cases": [{"number": 1, "folder": "a", "values": {"solver.load_time": "1.0"}}],
     }  # fmt: skip
     return {
