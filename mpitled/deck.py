@@ -26,6 +26,12 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+#: A deck is larger than that by mistake, and so is a key of so many parts, for which parsers take the square of time.
+_MOST_BYTES, _MOST_PARTS = 1 << 18, 100
+#: Smaller sizes, and numbers larger than its reciprocal, are slips: ratios and their cubes have to stay floats.
+_FINEST = 1e-30
+#: What is between the dots of a key, and what else there is in TOML.
+_TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"?|\'[^\'\n]*\'?|[\w-]+|[ \t]+|.', re.DOTALL)
 #: Units of the deck that are not SI: how many make one SI unit. Dividing by a power of ten rounds 5.1 mm to 0.0051 m.
 _PER_SI = {"mm": 1e3, "mm3": 1e9, "degrees": 180 / math.pi}
 
@@ -367,13 +373,20 @@ class _Source(NamedTuple):
     def error(self, name: str, what: str, value: Any = MISSING) -> InputError:
         # An override of a part, or of the section around it, is to blame too.
         overridden = any(f"{name}.".startswith(f"{o}.") or o.startswith(f"{name}.") for o in self.overridden)
-        shown = "" if value is MISSING else f" = {_show(value)}"
+        try:
+            shown = "" if value is MISSING else f" = {_show(value)}"
+        except (RecursionError, ValueError):  # nested without end, or an integer of thousands of digits
+            shown = ""
+        name = _shorten(name)
         return InputError(_line(f"{'--set' if overridden else self.path}: {name}{shown}: {what}"))
 
 
 def _parse(path: Path) -> dict[str, Any]:
     try:
-        content = path.read_bytes()
+        if not path.is_file() and not path.is_dir() and path.exists():
+            raise InputError(f"{path}: is a device or a pipe; give the path of a deck (TOML)")
+        with path.open("rb") as file:
+            content = file.read(_MOST_BYTES + 1)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}; give the path of a deck (TOML)") from None
     try:
@@ -381,10 +394,28 @@ def _parse(path: Path) -> dict[str, Any]:
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
         raise InputError(f"{path}: line {line}: is not UTF-8 text; a deck is a TOML file in UTF-8") from None
+    if len(content) > _MOST_BYTES or _most_parts(text) > _MOST_PARTS:
+        raise InputError(f"{path}: is no deck; one has less than {_MOST_BYTES} bytes and keys of few parts")
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: {_syntax(text, error)}") from None
+
+
+def _most_parts(text: str) -> int:
+    """Parts of the longest key."""
+    most, parts, dot = 0, 0, True
+    for token in _TOKEN.findall(text):
+        if token == ".":
+            parts, dot = (0 if dot else parts + 1), True
+            most = max(most, parts)
+        elif token.isspace() and token != "\n":
+            continue
+        elif len(token) > 1 or token.isalnum() or token in "_-":
+            parts, dot = (parts if dot else 0), False
+        else:
+            parts, dot = 0, True
+    return most
 
 
 def _syntax(text: str, error: Exception) -> str:
@@ -487,7 +518,7 @@ def _several(cls: type, entries: Any, name: str, source: _Source) -> tuple[Any, 
 
 def _unknown(written: str, valid: list[str], name: str) -> str:
     kind = "key" if name else "section or key"
-    if near := difflib.get_close_matches(written, valid, 1, 0.6):
+    if near := difflib.get_close_matches(written[:100], valid, 1, 0.6):
         return f"unknown {kind}; did you mean {near[0]}?"
     homes = [home for home, _, about in _declared() if about and about[0] == written]
     if homes and (name or written != "title"):
@@ -528,7 +559,8 @@ def _convert(hint: Any, value: Any, limits: str) -> Any:
         return _convert(last, value, limits)
     if origin is Literal:
         if type(value) is not type(args[0]) or value not in args:
-            near = difflib.get_close_matches(str(value), [str(a) for a in args], 1) if isinstance(value, str) else ()
+            known = [str(a) for a in args]
+            near = difflib.get_close_matches(value[:100], known, 1) if isinstance(value, str) else ()
             raise ValueError(f"is not offered; did you mean {near[0]}?" if near else "is not offered")
         return value
     if origin is tuple:
@@ -536,6 +568,8 @@ def _convert(hint: Any, value: Any, limits: str) -> Any:
     if hint is float and type(value) in (int, float):
         if abs(value) > sys.float_info.max or math.isnan(value):
             raise ValueError("is not a finite number")
+        if abs(value) > 1 / _FINEST or (limits.startswith("(0") and 0 < value < _FINEST):
+            raise ValueError(f"is not between {_FINEST:g} and {1 / _FINEST:g}")
         return _within(float(value), limits)
     if hint is int and type(value) is int:
         if abs(value) >= 2**31:
@@ -690,7 +724,8 @@ def _check(deck: Deck, source: _Source) -> None:
 
 def _check_tumour(deck: Deck, given: dict[str, Any], source: _Source) -> None:
     assert deck.tumour is not None
-    seed_volume = 4 / 3 * math.pi * given["tumour"]["seed_radius"] ** 3
+    radius = given["tumour"]["seed_radius"]
+    seed_volume = 4 / 3 * math.pi * radius * radius * radius  # a power of a slip raises OverflowError
     if given["tumour"]["volume"] < seed_volume:
         what = f"is less than the seed's {seed_volume:.4g} mm3; give more, or a smaller tumour.seed_radius"
         raise source.error("tumour.volume", what, given["tumour"]["volume"])

@@ -1,5 +1,11 @@
 """The errors that a user meets, each with the exit status of the command that ends with it."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
 
 class MpitledError(Exception):
     """An end with a reason: one line to the user, no traceback."""
@@ -24,3 +30,15 @@ class InterruptedRun(MpitledError):
     """Ended from outside (Ctrl-C, SIGTERM); what was written is readable, and the run can go on from there."""
 
     status = 4
+
+
+@contextmanager
+def damaged(path: Path, remedy: str) -> Iterator[None]:
+    """What goes wrong inside, with the contents of a file of ours that others may have changed, as an InputError."""
+    try:
+        yield
+    except MpitledError:
+        raise
+    except Exception as error:  # of h5py, json and numpy, each of which raises what it likes
+        reason = " ".join(str(error).split())[:100] or "it does not fit together"
+        raise InputError(f"{path}: is damaged ({type(error).__name__}: {reason}); {remedy}") from error

@@ -23,8 +23,8 @@ from mpitled.model import Model
 from mpitled.readers.meshfile import LARGEST_ID
 
 FE, EFG, GRID, AREAS, SCENE = "fe.inp", "efg.inp", "integration_points.csv", "surface_areas.csv", "scene.toml"
-#: Sections that the export writes anew: constraints are in the files, and materials go by sets that there are.
-_IN_FILES = ("material", "fixed", "displaced")
+#: Sections that the export writes anew: constraints and spheres are in the files, materials go by sets that there are.
+_IN_FILES = ("sphere", "material", "fixed", "displaced")
 _ROW = 16  # numbers in a line of a set
 _CHUNK = 1 << 16  # lines at once
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mpitled import __version__
-from mpitled.errors import InputError
+from mpitled.errors import InputError, damaged
 
 _SETUP = "bash jobs/brain.sh sets it up, or see jobs/environment.sh"
 
@@ -51,11 +51,9 @@ def contents(path: Path) -> dict[str, Any]:
 
     InputError if it is none of these, or damaged.
     """
-    from mpitled import store
-
     if path.is_dir():
         raise InputError(f"{path}: is a folder; give a file in it, model.h5 or result.vtkhdf")
-    with store.reading(path):
+    with damaged(path, "build the model anew, or run the deck again"):
         return _contents(path)
 
 

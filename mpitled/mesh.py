@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mpitled import room
 from mpitled.errors import InputError
 from mpitled.material import Material
 
@@ -15,6 +16,10 @@ from mpitled.material import Material
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 #: Corners of the reference hexahedron in the Abaqus/VTK order (paper, eq. 4.4).
 CORNERS = np.array([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
+
+
+#: Memory that each hexahedron takes while a model is built, at the least: 490 to 610 in blocks and phantoms.
+_HEXAHEDRON_BYTES = 500
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +74,12 @@ class Mesh:
     @property
     def n_cells(self) -> int:
         return len(self.hexahedra) + len(self.integration_points)
+
+
+def check_size(n_hexahedra: float, key: str, remedy: str = "ask for fewer") -> None:
+    """InputError if so many hexahedra, which a key of the deck asks for, are more than the machine has memory for."""
+    what = f"{key}: makes {n_hexahedra:.3g} hexahedra, which"
+    room.check_memory(_HEXAHEDRON_BYTES * n_hexahedra, what, remedy)
 
 
 def hexahedral_mesh(

@@ -17,8 +17,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import checksum
-from mpitled.errors import InputError
+from mpitled import checksum, room, vet
+from mpitled.errors import InputError, damaged
 from mpitled.material import Material
 from mpitled.model import Model
 
@@ -53,6 +53,27 @@ _MODEL_ARRAYS = {
     "prescribed_displacements": np.float64,
     "prescribed_turns": np.float64,
 }
+#: Their rows and columns, by name or number: kernels go where these say, and look no more.
+_MODEL_SHAPES: dict[str, tuple[str | int, ...]] = {
+    "points": ("nodes", 3),
+    "node_ids": ("nodes",),
+    "hexahedra": ("hexahedra", 8),
+    "domains": ("domains", "n"),
+    "domain_points": ("domains", 3),
+    "domain_volumes": ("domains",),
+    "domain_gradients": ("domains", "n", 3),
+    "domain_shapes": ("domains", "n"),
+    "field_domains": ("efg_nodes",),
+    "field_shapes": ("efg_nodes", "n"),
+    "material": ("cells",),
+    "mass": ("nodes",),
+    "prescribed_dofs": ("dofs",),
+    "prescribed_displacements": ("dofs",),
+    "prescribed_turns": ("dofs", 3),
+}
+_REBUILD, _AGAIN = "build the model anew", "run the deck again"
+#: Numbers in SI units are smaller by far.
+_LARGEST = 1e50
 
 
 def hdf5_version() -> str:
@@ -97,22 +118,39 @@ def write_model(path: Path, model: Model, key: str, scene: Mapping[str, Any] | N
 def read_model(path: Path) -> Model:
     """The whole model. InputError if the file is missing, not a model, or of another layout."""
     with _open_model(path) as file:
+        arrays = {name: file[name][...] for name in _MODEL_ARRAYS}
+        n_nodes, n_domains, n_cells = len(file["points"]), len(file["domains"]), len(file["material"])
+        node_sets, cell_sets, materials = (
+            _read_sets(file["node_sets"]),
+            _read_sets(file["cell_sets"]),
+            _read_materials(file),
+        )
+        _check_finite(arrays)
+        ends = {"hexahedra": n_nodes, "domains": n_nodes, "field_domains": n_domains, "material": len(materials)}
+        for name, end in (ends | {"prescribed_dofs": 3 * n_nodes}).items():
+            _check_numbers(arrays[name], end, name)
+        for sets, end in ((node_sets, n_nodes), (cell_sets, n_cells)):
+            for name, members in sets.items():
+                _check_numbers(members, end, name)
         return Model(
-            **{name: file[name][...] for name in _MODEL_ARRAYS},
+            **arrays,
             n_fe_nodes=int(file.attrs["n_fe_nodes"]),
-            node_sets=_read_sets(file["node_sets"]),
-            cell_sets=_read_sets(file["cell_sets"]),
+            node_sets=node_sets,
+            cell_sets=cell_sets,
             surface_areas=file["surface_areas"][...] if "surface_areas" in file else None,
-            materials=_read_materials(file),
-            figures=_read_json(file, "figures"),
-            remarks=tuple(_read_json(file, "remarks")),
+            materials=materials,
+            figures=_read_figures(file),
+            remarks=_read_remarks(file),
         )
 
 
 def read_cells(path: Path) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Hexahedra (n, 8), support domains (m, k) and their points (m, 3), m: all that a partition is made from."""
     with _open_model(path) as file:
-        return file["hexahedra"][...], file["domains"][...], file["domain_points"][...]
+        hexahedra, domains = file["hexahedra"][...], file["domains"][...]
+        for cells in (hexahedra, domains):
+            _check_numbers(cells, len(file["points"]), "cells")
+        return hexahedra, domains, file["domain_points"][...]
 
 
 def read_points(path: Path) -> NDArray[np.float64]:
@@ -132,7 +170,7 @@ def model_key(path: Path) -> str | None:
 
 def check_model(path: Path) -> None:
     """Read all of the model; InputError names what does not have the checksum that it was written with."""
-    with reading(path), _open_model(path) as file:
+    with _open_model(path) as file:
         if broken := _first_broken(file):
             raise InputError(f"{path}: is damaged: {broken} is not what was written")
 
@@ -146,19 +184,19 @@ def read_sets(path: Path) -> tuple[dict[str, NDArray[np.int64]], dict[str, NDArr
 def read_figures(path: Path) -> dict[str, Any]:
     """What the preprocessor counted and measured, by name."""
     with _open_model(path) as file:
-        return _read_json(file, "figures")
+        return _read_figures(file)
 
 
 def read_scene(path: Path) -> dict[str, Any]:
     """The deck that the model was built from, in the deck's layout and units."""
     with _open_model(path) as file:
-        return _read_json(file, "scene") if "scene" in file else {}
+        return dict(_read_json(file, "scene")) if "scene" in file else {}
 
 
 def read_remarks(path: Path) -> list[str]:
     """What the readers and meshers skipped, repaired or took for granted, a line each."""
     with _open_model(path) as file:
-        return list(_read_json(file, "remarks"))
+        return list(_read_remarks(file))
 
 
 def model_contents(path: Path) -> dict[str, Any]:
@@ -171,11 +209,11 @@ def model_contents(path: Path) -> dict[str, Any]:
             "support_domains": len(file["domains"]),
             "domain_nodes": file["domains"].shape[1],
             "prescribed_dofs": len(file["prescribed_dofs"]),
-            "materials": _read_json(file, "materials"),
+            "materials": [asdict(material) for material in _read_materials(file)],
             "node_sets": {name: len(members) for name, members in _read_sets(file["node_sets"]).items()},
             "cell_sets": {name: len(members) for name, members in _read_sets(file["cell_sets"]).items()},
-            "figures": _read_json(file, "figures"),
-            "remarks": _read_json(file, "remarks"),
+            "figures": _read_figures(file),
+            "remarks": list(_read_remarks(file)),
         }
 
 
@@ -200,21 +238,19 @@ def describe_model(path: Path) -> str:
 
 def read_grid(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Places (n, 3) and volumes (n,) of a grid of integration points: datasets x, y, z, volume at the file's top."""
-    with _open(path) as file:
+    with _open(path) as file, damaged(path, "write it anew"):
         names = ("x", "y", "z", "volume")
-        if missing := [name for name in names if not isinstance(file.get(name), h5py.Dataset)]:
+        if missing := [name for name in names if name not in file]:
             raise InputError(f"{path}: has no dataset '{missing[0]}'; give x, y, z and volume")
-        shapes = {file[name].shape for name in names}
-        shape = shapes.pop()
-        if shapes or len(shape) != 1 or any(file[name].dtype.kind not in "fiu" for name in names):
+        given = [vet.member(file, name, path) for name in names]
+        kinds = {item.dtype.kind if isinstance(item, h5py.Dataset) else "" for item in given}
+        if not kinds <= set("fiu") or {len(item.shape or ()) for item in given} != {1} or len({*map(len, given)}) > 1:
             raise InputError(f"{path}: x, y, z and volume are not four lists of as many numbers; correct them")
-        # What was never written takes no room in the file, and must not here.
-        if shape[0] > 1000 * path.stat().st_size:
-            raise InputError(f"{path}: claims {shape[0]} points and has {path.stat().st_size} bytes; write it anew")
-        try:
-            columns = [file[name][...].astype(np.float64) for name in names]
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read as HDF5 ({str(error).splitlines()[0]})") from None
+        for item in given:
+            vet.check_dataset(item, path)
+        # Packed data may be a thousand times what is in the file.
+        room.check_memory(32 * len(given[0]), f"{path}: its {len(given[0])} points", "give fewer")
+        columns = [item[...].astype(np.float64) for item in given]
     return np.stack(columns[:3], axis=1), columns[3]
 
 
@@ -230,24 +266,65 @@ def write_columns(path: Path, groups: Mapping[str, Mapping[str, Sequence[float |
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """What HDF5 stumbles over in a damaged file, as one line that names it."""
-    try:
-        yield
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-        raise InputError(f"{path}: is damaged ({' '.join(str(error).split())})") from None
-
-
-@contextmanager
 def _open_model(path: Path) -> Iterator[h5py.File]:
-    with _open(path) as file:
-        if file.attrs.get("format") != "mpitled model":
+    with _open(path) as file, damaged(path, _REBUILD):
+        if _attribute(file, "format") != "mpitled model":
             raise InputError(f"{path}: is not a model of mpitled; build the model from its deck")
-        if file.attrs["layout"] != MODEL_LAYOUT:
-            raise InputError(
-                f"{path}: has layout {file.attrs['layout']}, this version reads {MODEL_LAYOUT}; build the model anew"
-            )
+        if (layout := _attribute(file, "layout")) != MODEL_LAYOUT:
+            raise InputError(f"{path}: has layout {layout}, this version reads {MODEL_LAYOUT}; {_REBUILD}")
+        vet.check_file(file, path, numbers=True)
+        _check_shapes(file)
         yield file
+
+
+def _attribute(holder: h5py.Group, name: str) -> str | int | None:
+    """A text or a whole number, if it is there as one: what else attributes can hold is never read."""
+    if name not in holder.attrs:
+        return None
+    kind = holder.attrs.get_id(name)
+    if kind.shape != () or (kind.dtype.kind not in "iuS" and not h5py.check_string_dtype(kind.dtype)):
+        raise ValueError(f"attribute {name} is neither a number nor text")
+    value = holder.attrs[name]
+    return value if isinstance(value, str) else value.decode() if isinstance(value, bytes) else int(value)
+
+
+def _check_shapes(file: h5py.File) -> None:
+    """ValueError unless the arrays of a model have the types that they are written in, and fit each other."""
+    n_nodes, n_fe_nodes = len(file["points"]), _attribute(file, "n_fe_nodes")
+    if not isinstance(n_fe_nodes, int) or not 0 <= n_fe_nodes <= n_nodes:
+        raise ValueError(f"n_fe_nodes is not between 0 and {n_nodes}")
+    sizes: dict[str, int] = {"efg_nodes": n_nodes - n_fe_nodes}
+    sizes["cells"] = len(file["hexahedra"]) + len(file["domains"])
+    for name, dtype in _MODEL_ARRAYS.items():
+        array = file[name]
+        expected = _MODEL_SHAPES[name]
+        fits = len(array.shape) == len(expected) and array.dtype == dtype
+        if not fits or any(
+            n != (sizes.setdefault(size, n) if isinstance(size, str) else size)
+            for n, size in zip(array.shape, expected, strict=True)
+        ):
+            raise ValueError(f"{name} has type {array.dtype} and shape {array.shape}")
+    areas = file.get("surface_areas")
+    if areas is not None and (areas.shape != (n_nodes, 3) or areas.dtype != np.float64):
+        raise ValueError(f"surface_areas has type {areas.dtype} and shape {areas.shape}")
+
+
+def _check_numbers(numbers: NDArray[np.integer], end: int, what: str) -> None:
+    """ValueError unless all of them count something of which there are `end`."""
+    if numbers.size and not 0 <= numbers.min() <= numbers.max() < end:
+        raise ValueError(f"{what} has numbers beyond 0 to {end - 1}")
+
+
+def _check_finite(arrays: Mapping[str, NDArray[Any]]) -> None:
+    """ValueError unless all numbers are there, and small enough to be squared and multiplied."""
+    for name, values in arrays.items():
+        if values.dtype.kind == "f" and not (np.abs(values) < _LARGEST).all():
+            raise ValueError(f"{name} has numbers that are none, or beyond {_LARGEST:g}")
+
+
+def _check_ascending(numbers: NDArray[np.integer], what: str) -> None:
+    if (np.diff(numbers) <= 0).any():
+        raise ValueError(f"{what} do not ascend")
 
 
 def _open(path: Path) -> h5py.File:
@@ -319,8 +396,9 @@ def _write_sets(group: h5py.Group, sets: dict[str, NDArray[np.int64]]) -> None:
 
 
 def _read_sets(group: h5py.Group) -> dict[str, NDArray[np.int64]]:
-    members = group["members"][...]
-    slices = [members[start:stop] for start, stop in pairwise(group["offsets"][...])]
+    members, offsets = group["members"][...], group["offsets"][...]
+    _check_numbers(offsets, len(members) + 1, "offsets")
+    slices = [members[start:stop] for start, stop in pairwise(offsets)]
     return dict(zip(_read_json(group, "names"), slices, strict=True))
 
 
@@ -367,7 +445,23 @@ def _first_broken(file: h5py.File) -> str | None:
 
 
 def _read_materials(file: h5py.File) -> tuple[Material, ...]:
-    return tuple(Material(**values) for values in _read_json(file, "materials"))
+    materials = tuple(Material(**values) for values in _read_json(file, "materials"))
+    for material in materials:
+        _, *numbers = asdict(material).values()
+        if not np.isfinite(numbers).all() or not np.isfinite([material.lam, material.mu]).all():
+            raise ValueError(f"material {material.name} has moduli that are no numbers")
+    return materials
+
+
+def _read_figures(file: h5py.File) -> dict[str, float]:
+    figures = dict(_read_json(file, "figures"))
+    if not all(isinstance(value, int | float) for value in figures.values()):
+        raise ValueError("figures holds what is no number")
+    return figures
+
+
+def _read_remarks(file: h5py.File) -> tuple[str, ...]:
+    return tuple(map(str, _read_json(file, "remarks")))
 
 
 # --- partitions --------------------------------------------------------------------------------------------------
@@ -478,20 +572,40 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
             group = file[f"partitions/{n_parts}"]
             cells = group["cells"][_range(group["cell_offsets"], part)]
             nodes = group["nodes"][_range(group["node_offsets"], part)]
+            _check_numbers(nodes, len(group["rows"]), "nodes")
             rows = read_rows(group["rows"], nodes)
             first_row, end_row = group["owned_offsets"][part : part + 2]
             own = _range(group["neighbour_offsets"], part)
             neighbours = group["neighbours"][own]
             shared_offsets = group["shared_offsets"][own.start : own.stop + 1]
+            _check_numbers(shared_offsets, len(group["shared"]) + 1, "shared_offsets")
             shared = group["shared"][shared_offsets[0] : shared_offsets[-1]]
             shared_offsets = shared_offsets - shared_offsets[0]
+            if len(shared_offsets) != len(neighbours) + 1 or (np.diff(shared_offsets) < 0).any():
+                raise ValueError("shared_offsets do not fit the neighbours")
+            for name, numbers, end in (("neighbours", neighbours, n_parts), ("rows", rows, n_nodes)):
+                _check_numbers(numbers, end, name)
+            for name, numbers, end in (("cells", cells, n_hexahedra + n_domains), ("nodes", nodes, n_nodes)):
+                _check_numbers(numbers, end, name)
+                _check_ascending(numbers, name)
+            if part in neighbours or not np.isin(shared, nodes).all():
+                raise ValueError("a part shares with itself, or nodes that are not its own")
 
         own_hexahedra, own_domains = np.split(cells, [np.searchsorted(cells, n_hexahedra)])
         own_domains = own_domains - n_hexahedra
         dofs, prescribed = _matching(file["prescribed_dofs"], nodes, 3)
         field_domains, fields_here = _matching(file["field_domains"], own_domains, 1)
         n_fe_nodes = int(file.attrs["n_fe_nodes"])
-        return PartRows(
+        hexahedra, domains = read_rows(file["hexahedra"], own_hexahedra), read_rows(file["domains"], own_domains)
+        material, materials = read_rows(file["material"], cells), _read_materials(file)
+        _check_numbers(material, len(materials), "material")
+        _check_ascending(dofs, "prescribed_dofs")
+        for name, numbers in (("hexahedra", hexahedra), ("domains", domains)):
+            # As `localise` will find them: a node of which this part has no copy would be beyond its arrays.
+            _check_numbers(numbers, n_nodes, name)
+            if numbers.size and not (nodes.take(np.searchsorted(nodes, numbers), mode="clip") == numbers).all():
+                raise ValueError(f"{name} have nodes that their part has not")
+        part_rows = PartRows(
             n_parts=n_parts,
             part=part,
             n_nodes=n_nodes,
@@ -506,13 +620,14 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
             first_row=int(first_row),
             points=read_rows(file["points"], nodes),
             mass=read_rows(file["mass"], nodes),
-            hexahedra=read_rows(file["hexahedra"], own_hexahedra),
+            hexahedra=hexahedra,
+            domains=domains,
             **{
                 name: read_rows(file[name], own_domains)
-                for name in ("domains", "domain_points", "domain_volumes", "domain_gradients", "domain_shapes")
+                for name in ("domain_points", "domain_volumes", "domain_gradients", "domain_shapes")
             },
-            material=read_rows(file["material"], cells),
-            materials=_read_materials(file),
+            material=material,
+            materials=materials,
             prescribed_dofs=dofs,
             prescribed_displacements=read_rows(file["prescribed_displacements"], prescribed),
             prescribed_turns=read_rows(file["prescribed_turns"], prescribed),
@@ -523,6 +638,8 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
             shared=shared,
             shared_offsets=shared_offsets,
         )
+        _check_finite({f.name: v for f in fields(PartRows) if isinstance(v := getattr(part_rows, f.name), np.ndarray)})
+        return part_rows
 
 
 def read_rows(dataset: h5py.Dataset, rows: NDArray[np.int64]) -> NDArray[Any]:
@@ -551,6 +668,8 @@ def read_rows(dataset: h5py.Dataset, rows: NDArray[np.int64]) -> NDArray[Any]:
 
 def _range(offsets: h5py.Dataset, part: int) -> slice:
     start, stop = offsets[part : part + 2]
+    if not 0 <= start <= stop:
+        raise ValueError(f"{offsets.name} do not ascend")
     return slice(int(start), int(stop))
 
 
@@ -574,6 +693,22 @@ def _matching(
 _FINISHED, _UNFINISHED = "result.vtkhdf", "result.partial.vtkhdf"
 _VTK_VERTEX, _VTK_HEXAHEDRON = 1, 12
 _HEXAHEDRON, _EFG_NODE, _INTEGRATION_POINT = 0, 1, 2
+
+
+#: Bytes in a result, of the mesh and of each frame: of a point (place, two numbers; two displacements), of a cell
+#: (offset, type, number, material, kind, part; J), and of a corner of a cell.
+_POINT_BYTES, _CELL_BYTES, _CORNER_BYTES = (24 + 16, 48), (8 + 1 + 8 + 2 + 1 + 4, 8), 8
+#: Of the tables of steps for each frame; and of the deck, and HDF5's own.
+_FRAME_BYTES, _ON_TOP = 537, 47_800
+
+
+def result_bytes(rows: PartRows, n_frames: int) -> int:
+    """Size of the whole model's result.vtkhdf with so many frames, to some kilobytes; see `ResultWriter`."""
+    n_hexahedra, n_vertices = rows.n_hexahedra, rows.n_nodes - rows.n_fe_nodes + rows.n_domains
+    n_points = rows.n_nodes + rows.n_domains
+    size = sum(_POINT_BYTES[k] * n_points * n for k, n in enumerate((1, n_frames)))
+    size += sum(_CELL_BYTES[k] * (n_hexahedra + n_vertices) * n for k, n in enumerate((1, n_frames)))
+    return size + _CORNER_BYTES * (8 * n_hexahedra + n_vertices) + _FRAME_BYTES * n_frames + _ON_TOP
 
 
 class ResultWriter:
@@ -957,7 +1092,10 @@ def _make(group: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any, **op
 
 
 class Result:
-    """The results of a run, read as they are asked for: the grid as it is in the file, or in the model's order."""
+    """The results of a run, read as they are asked for: the grid as it is in the file, or in the model's order.
+
+    Use it `with damaged` where the file may come from others.
+    """
 
     def __init__(self, file: h5py.File, path: Path) -> None:
         self._file, self._grid, self.path = file, file["VTKHDF"], path
@@ -1085,6 +1223,12 @@ def _ascending(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
     return rows[np.argsort(numbers[rows])]
 
 
+def unfinished_bytes(directory: Path) -> int:
+    """Room that the unfinished results in a directory take, which a run there goes on with or writes anew."""
+    path = Path(directory) / _UNFINISHED
+    return path.stat().st_size if path.exists() else 0
+
+
 def is_unfinished(directory: Path) -> bool:
     """Whether a directory holds results of a run that did not come to its end."""
     return (Path(directory) / _UNFINISHED).exists()
@@ -1092,13 +1236,21 @@ def is_unfinished(directory: Path) -> bool:
 
 def is_checkpoint(path: Path) -> bool:
     """Whether the HDF5 file is a checkpoint, of whatever layout; InputError if it is no HDF5 file."""
-    with _open(path) as file, reading(path):
+    with _open(path) as file, damaged(path, _AGAIN):
+        vet.check_file(file, path, numbers=True)
         return "told" in file and "node" in file
+
+
+def check_hdf5(path: Path) -> None:
+    """InputError if another library that is about to read a file would be led out of it, or told to take too much."""
+    with _open(path) as file, damaged(path, "write it anew"):
+        vet.check_file(file, path)
 
 
 def is_result(path: Path) -> bool:
     """Whether the HDF5 file is a result of ours, of whatever layout; InputError if it is no HDF5 file."""
-    with _open(path) as file:
+    with _open(path) as file, damaged(path, "give another file"):
+        vet.check_file(file, path)
         return "mpitled" in file and "VTKHDF" in file
 
 
@@ -1114,9 +1266,15 @@ def open_result(path: Path) -> Result:
             raise InputError(f"{path}: holds no result; give the folder that 'mpitled run' wrote")
         path = there[0]
     file = _open(path)
-    layout = file["mpitled"].attrs.get("layout") if "mpitled" in file and "VTKHDF" in file else None
-    if layout == RESULT_LAYOUT:
-        return Result(file, path)
+    try:
+        with damaged(path, _AGAIN):
+            vet.check_file(file, path, numbers=True)
+            layout = _attribute(file["mpitled"], "layout") if "mpitled" in file and "VTKHDF" in file else None
+            if layout == RESULT_LAYOUT:
+                return Result(file, path)
+    except InputError:
+        file.close()
+        raise
     file.close()
     if layout is None:
         raise InputError(f"{path}: is not a result of mpitled; give a file that 'mpitled run' wrote")
@@ -1182,8 +1340,9 @@ def write_checkpoint(
 
 def checkpoint_contents(path: Path) -> dict[str, Any]:
     """What a checkpoint tells. Reads all of it; InputError if it is none of this layout, or not what was written."""
-    with _open(path) as file, reading(path):
-        layout = file.attrs.get("layout") if "told" in file and "node" in file else None
+    with _open(path) as file, damaged(path, _AGAIN):
+        vet.check_file(file, path, numbers=True)
+        layout = _attribute(file, "layout") if "told" in file and "node" in file else None
         if layout == CHECKPOINT_LAYOUT and (broken := _first_broken(file)) is None:
             return dict(_read_json(file, "told"))
     if layout is None:
@@ -1198,9 +1357,12 @@ def read_checkpoint(path: Path, nodes: NDArray[np.int64]) -> tuple[dict[str, NDA
 
     Of a file that `checkpoint_contents` has read.
     """
-    with _open(path) as file:
+    with _open(path) as file, damaged(path, _AGAIN):
+        vet.check_file(file, path, numbers=True)
         found, rows = _matching(file["node"], nodes, 1)
         order = np.argsort(found)
+        if not np.array_equal(found[order], nodes):
+            raise ValueError("it is of other nodes")
         names: list[str] = []
         file["nodal"].visititems(lambda name, thing: names.append(name) if isinstance(thing, h5py.Dataset) else None)
         return {name: read_rows(file["nodal"][name], rows)[order] for name in names}, file["own"][...]

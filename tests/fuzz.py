@@ -1,117 +1,244 @@
-"""Fuzz the readers: `python tests/fuzz.py [N]` mutates decks N times (10,000) and checks each as `mpitled check` does.
+"""Fuzz every reader: `python tests/fuzz.py` breaks whole files at random and prints how their reading ended.
 
-Each has to end in a mesh or in one line of an InputError, within 5 s and 2 GiB, and leave no file behind.
+A table says for each reader how many inputs were tried, how many of them ended in a result and how many in one line of
+an InputError, how many ended otherwise (crashes) or not within 15 s (hangs), and the largest memory. Exit status 1 if
+there was a crash or a hang. Readers work in processes of their own, which may take 1 GiB. `--engine hypothesis` lets
+hypothesis choose what is broken, `--engine atheris` the coverage of the program (pip install atheris).
 """
 
 from __future__ import annotations
 
+import argparse
+import contextlib
+import faulthandler
+import os
 import random
-import re
 import resource
+import selectors
+import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
 import traceback
 import warnings
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from decks import KINDS, void_decks
+if TYPE_CHECKING:
+    from hostile import Reader
 
-from mpitled.errors import InputError
-from mpitled.speed import overview
-
-LIMIT_S, LIMIT_BYTES = 5, 2 << 30
-_NASTY = [
-    "", "-", "1e", "1e999", "-1e308", "nan", "inf", "0x10", "1_0", "1.0-3", "1.0D+2", "999999999999999999", "1e18",
-    "-5", "0", "2147483648", "9" * 400, "1.5", '"', ",", "*", "**", "$", "&x", "\t", "\x00", "é", "  ", "1 2", "+",
-]  # fmt: skip
+ENGINES = ("random", "hypothesis", "atheris")
+LONGEST_S, MOST_BYTES = 15, 1 << 30
+#: Inputs of slow readers, as a share of those of the others.
+SHARES = {"deck, with the time it takes": 0.1, "decks of a mixed mesh": 0.2, "model.h5": 0.5, "result.vtkhdf": 0.5}
 
 
-def mutated(text: str, rng: random.Random) -> bytes:
-    """One to six changes: bytes dropped or changed, lines swapped, dropped or doubled, numbers broken, ends cut off."""
-    data = text.encode()
-    for _ in range(rng.choice([1, 1, 1, 2, 3, 6])):
-        lines = data.split(b"\n")
-        kind = rng.randrange(9)
-        at = rng.randrange(len(data)) if data else 0
-        i, j = rng.randrange(len(lines)), rng.randrange(len(lines))
-        if kind == 0:
-            data = data[:at] + data[at + rng.randint(1, 12) :]
-        elif kind == 1 and data:
-            data = data[:at] + bytes([rng.randrange(256)]) + data[at + 1 :]
-        elif kind == 2:
-            lines[i], lines[j] = lines[j], lines[i]
-            data = b"\n".join(lines)
-        elif kind == 3:
-            data = b"\n".join(lines[:i] + lines[i + 1 :])
-        elif kind == 4:
-            data = b"\n".join([*lines[:i], lines[j], *lines[i:]])
-        elif kind in (5, 6):
-            found = list(re.finditer(rb"[\w.+-]+", data))
-            if found:
-                word = rng.choice(found)
-                data = data[: word.start()] + rng.choice(_NASTY).encode() + data[word.end() :]
-        elif kind == 7:
-            data = data[:at]
-        else:
-            data = data.replace(b"\n", rng.choice([b"\r\n", b"\r", b"\n\n", b",\n"]), rng.randint(1, 20))
-    return data
+# --- in a process of its own ---------------------------------------------------------------------------------------
 
 
-def fuzz(n: int, first: int = 0) -> Counter[str]:
-    """How many ended how; prints what must not be and counts it as "broken"."""
-    signal.signal(signal.SIGALRM, _too_long)
-    warnings.simplefilter("error")
-    kinds = {**KINDS, "mixed": {"scene.toml": void_decks()["scene.toml"], **void_decks()}}
-    names = list(kinds)
-    ends: Counter[str] = Counter()
-    with tempfile.TemporaryDirectory() as folder:
-        for seed in range(first, first + n):
-            rng = random.Random(seed)
-            # The mixed mesh takes longest, and has decks of its own.
-            name = rng.choice(names[:-1]) if rng.random() > 0.1 else names[-1]
-            files = kinds[name]
-            victim = rng.choice(list(files))
-            written = set()
-            for file, text in files.items():
-                path = Path(folder, file)
-                path.parent.mkdir(exist_ok=True)
-                path.write_bytes(mutated(text, rng) if file == victim else text.encode())
-                written.add(path)
-            broken = ""
-            try:
-                signal.alarm(LIMIT_S)
-                overview.check(Path(folder, next(iter(files))))
-                ends["mesh"] += 1
-            except InputError as error:
-                ends["error"] += 1
-                if "\n" in str(error) or not str(error):
-                    broken = f"a message that is not one line: {error!r}"
-            except (Exception, SystemExit):
-                broken = traceback.format_exc()
-            finally:
-                signal.alarm(0)
-            if extra := {path for path in Path(folder).rglob("*") if path.is_file()} - written:
-                broken += f"left {extra}"
-            if broken:
-                ends["broken"] += 1
-                print(f"seed {seed} ({name}, {victim}): {broken}", file=sys.stderr)
-            for path in Path(folder).rglob("*"):
-                if path.is_file():
-                    path.unlink()
-    return ends
+def work(reader: Reader, engine: str, first: int, count: int, report: int, folder: Path) -> None:
+    """Try inputs number `first` and on; says of each to the descriptor `report` that it begins, and how it ended."""
+
+    from hostile import attempt
+
+    def tell(word: str) -> None:
+        os.write(report, word.encode() + b"\n")
+
+    def one(rng: random.Random, name: object) -> None:
+        tell(f"begin {name}")
+        signal.setitimer(signal.ITIMER_PROF, LONGEST_S)  # of computing: others may use the machine too
+        try:
+            tell(attempt(reader, folder, rng))
+        except TimeoutError:
+            tell("hang")
+            traceback.print_exc()
+        except (Exception, SystemExit):
+            tell("crash")
+            traceback.print_exc()
+        except BaseException:  # of hypothesis, which wants no more of this input
+            tell("over")
+            raise
+        finally:
+            signal.setitimer(signal.ITIMER_PROF, 0)
+        tell(f"memory {_peak()}")
+
+    numbers = iter(range(first, first + count))
+    if engine == "random":
+        for number in numbers:
+            one(random.Random(number), number)
+    elif engine == "hypothesis":
+        import hypothesis
+        from hypothesis import strategies
+
+        @hypothesis.seed(first)
+        @hypothesis.settings(
+            max_examples=count, database=None, deadline=None, phases=[hypothesis.Phase.generate],
+            suppress_health_check=list(hypothesis.HealthCheck),
+        )  # fmt: skip
+        @hypothesis.given(strategies.randoms(use_true_random=False))
+        def search(rng: random.Random) -> None:
+            one(rng, next(numbers, "last"))
+
+        search()
+    else:
+        import atheris
+
+        class Directed(random.Random):
+            """Takes its bits from the bytes that atheris found worth while, and zeros when they are used up."""
+
+            def __init__(self, data: bytes) -> None:
+                self._data = atheris.FuzzedDataProvider(data)
+
+            def random(self) -> float:
+                return self.getrandbits(53) / (1 << 53)
+
+            def getrandbits(self, k: int) -> int:
+                return int.from_bytes(self._data.ConsumeBytes(-(-k // 8)), "little") & ((1 << k) - 1)
+
+        arguments = [
+            sys.argv[0],
+            f"-runs={count}",
+            f"-seed={first + 1}",
+            "-max_len=512",
+            "-rss_limit_mb=0",
+            "-verbosity=0",
+        ]
+        atheris.Setup(arguments, lambda data: one(Directed(data), next(numbers, "last")))
+        atheris.Fuzz()
+
+
+def _instrumented(engine: str) -> contextlib.AbstractContextManager[object]:
+    """Imports that tell atheris where the program goes."""
+    if engine != "atheris":
+        return contextlib.nullcontext()
+    import atheris
+
+    return atheris.instrument_imports(include=["mpitled"])  # type: ignore[no-any-return]
 
 
 def _too_long(*_: object) -> None:
-    raise TimeoutError(f"took more than {LIMIT_S} s")
+    raise TimeoutError(f"took more than {LONGEST_S} s")
+
+
+def _worker(name: str, engine: str, first: int, count: int, scratch: Path) -> None:
+    report = os.dup(1)
+    os.dup2(2, 1)  # what libraries print is for the log
+    faulthandler.enable()
+    with _instrumented(engine):
+        from hostile import readers
+
+        reader = readers(scratch)[name]
+    warnings.simplefilter("ignore", ResourceWarning)
+    signal.signal(signal.SIGPROF, _too_long)
+    most = MOST_BYTES + resource.getpagesize() * int(Path("/proc/self/statm").read_text().split()[0])
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 30, 1 << 30))
+    with tempfile.TemporaryDirectory() as folder:
+        with contextlib.suppress(FileNotFoundError):
+            Path("/proc/self/clear_refs").write_text("5")  # the largest memory from here on
+        work(reader, engine, first, count, report, Path(folder))
+
+
+def _peak() -> int:
+    status = Path("/proc/self/status").read_text()
+    return 1024 * int(status.partition("VmHWM:")[2].split()[0])
+
+
+# --- the table -----------------------------------------------------------------------------------------------------
+
+
+def fuzz(name: str, count: int, engine: str, first: int, scratch: Path, log: Path) -> Counter[str]:
+    """How many inputs of a reader ended how, "memory" in bytes; a process that dies is followed by another."""
+    ends: Counter[str] = Counter()
+    with log.open("ab") as said:
+        while ends["tried"] < count:
+            begun = first + ends["tried"]
+            words = [sys.executable, __file__, "--worker", name, "--engine", engine, "--scratch", str(scratch)]
+            words += ["--first", str(begun), "--count", str(count - ends["tried"])]
+            process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=said, stdin=subprocess.DEVNULL)
+            before, died = ends["tried"], _follow(process, ends)
+            if died and ends["tried"] == before:
+                raise RuntimeError(f"{name}: its process ended with {process.returncode} before any input; see {log}")
+            if not died:
+                break
+    return ends
+
+
+def _follow(process: subprocess.Popen[bytes], ends: Counter[str]) -> bool:
+    """Count what a worker says; whether it died of an input, which is counted as a crash or a hang."""
+    assert process.stdout is not None
+    at_work = False
+    with process, selectors.DefaultSelector() as selector:
+        selector.register(process.stdout, selectors.EVENT_READ)
+        while True:
+            # The timer inside comes first where it can: it counts the time of computing alone.
+            if not selector.select(8 * LONGEST_S):
+                process.kill()
+                ends["hang"] += 1
+                return True
+            line = process.stdout.readline().decode().split()
+            if not line:
+                process.wait()
+                ends["crash"] += at_work
+                return at_work or process.returncode not in (0, None)
+            at_work = line[0] == "begin"
+            if at_work or line[0] == "over":
+                ends["tried"] += 1 if at_work else -1
+            elif line[0] == "memory":
+                ends["memory"] = max(ends["memory"], int(line[1]))
+            else:
+                ends[line[0]] += 1
+
+
+def table(rows: dict[str, Counter[str]]) -> str:
+    """Markdown, a line for each reader."""
+    lines = [
+        "| reader | inputs | result | one line | crashes | hangs | largest memory |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, ends in rows.items():
+        counts = [ends[end] for end in ("tried", "result", "error", "crash", "hang")]
+        memory = f"{ends['memory'] / 2**20:.0f} MiB" if ends["memory"] else "-"
+        lines.append(f"| {name} | {' | '.join(f'{n:,}' for n in counts)} | {memory} |")
+    return "\n".join(lines)
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("count", type=int, nargs="?", default=2000, help="inputs for each reader (%(default)s)")
+    parser.add_argument("--engine", choices=ENGINES, default="random")
+    parser.add_argument("--first", type=int, default=0, help="number of the first input (0)")
+    parser.add_argument("--only", default="", help="readers whose names contain this")
+    parser.add_argument("--log", type=Path, default=Path("fuzz.log"), help="what went wrong (%(default)s)")
+    parser.add_argument("--worker", help=argparse.SUPPRESS)
+    parser.add_argument("--scratch", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--count", type=int, dest="of_worker", help=argparse.SUPPRESS)
+    options = parser.parse_args(words)
+    if options.worker:
+        _worker(options.worker, options.engine, options.first, options.of_worker, options.scratch)
+        return 0
+    from hostile import readers
+
+    rows: dict[str, Counter[str]] = {}
+    scratch, begin = Path(tempfile.mkdtemp()), time.perf_counter()
+    try:
+        for name in readers(scratch):
+            if options.only.casefold() in name.casefold():
+                count = max(1, round(options.count * SHARES.get(name, 1)))
+                rows[name] = fuzz(name, count, options.engine, options.first, scratch, options.log)
+                print(table({name: rows[name]}).splitlines()[-1], file=sys.stderr, flush=True)
+    finally:
+        shutil.rmtree(scratch)
+    total = sum(ends["tried"] for ends in rows.values())
+    wrong = sum(ends["crash"] + ends["hang"] for ends in rows.values())
+    print(table(rows))
+    print(f"{total:,} inputs in {time.perf_counter() - begin:.0f} s; {wrong} crashes and hangs")
+    return int(wrong > 0)
 
 
 if __name__ == "__main__":
-    resource.setrlimit(resource.RLIMIT_DATA, (LIMIT_BYTES, LIMIT_BYTES))
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 10_000
-    begin = time.perf_counter()
-    result = fuzz(count, int(sys.argv[2]) if len(sys.argv) > 2 else 0)
-    print(f"{count} decks in {time.perf_counter() - begin:.0f} s: " + ", ".join(f"{k} {v}" for k, v in result.items()))
-    sys.exit(bool(result["broken"]))
+    sys.exit(main())

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from conftest import ENVIRONMENT, ROOT, ranks
 
+from mpitled.errors import InputError
 from mpitled.store import open_result
 
 SCRIPTS = ("slurm.sh", "pbs.sh")
@@ -67,16 +68,25 @@ def test_a_job_builds_cuts_and_runs(tmp_path, script):
         assert result.metadata["ranks"] == 2
 
 
+def begun(folder: Path) -> bool:
+    """Whether a result can be read already, and not just its file is there."""
+    try:
+        with open_result(folder):
+            return True
+    except InputError:
+        return False
+
+
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_a_job_ends_in_order_before_its_time_is_up(tmp_path, script):
     """SLURM sends a signal; PBS sends none in time, so that the script has a clock."""
     words, variables = cluster(tmp_path, script, RUN_SECONDS="15", SET="solver.load_time=5000.0")
     if script == "slurm.sh":
         words += ["--set", "solver.load_time=5000.0"]
-    file = tmp_path / "out" / "scene" / "result.partial.vtkhdf"
+    folder = tmp_path / "out" / "scene"
     with subprocess.Popen(words, env=variables, stderr=subprocess.PIPE, text=True) as process:
         deadline = time.time() + 60
-        while script == "slurm.sh" and not file.exists() and time.time() < deadline:
+        while script == "slurm.sh" and not begun(folder) and time.time() < deadline:
             time.sleep(0.1)
         if script == "slurm.sh":
             process.send_signal(signal.SIGUSR1)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 
 import pytest
 from conftest import mpitled
 
 from mpitled.deck import load_deck
+from mpitled.errors import InputError
 from mpitled.solver.halo import World
-from mpitled.solver.run import prepare
+from mpitled.solver.run import prepare, run
 from mpitled.speed.dry import left_out, reasons
 from mpitled.speed.witness import kernel_names
 from mpitled.store import open_result
@@ -28,6 +30,8 @@ nodes = "x0"
 [[displaced]]
 nodes = "x1"
 displacement = [0.1, 0.0, 0.0]
+[support]
+nodes = 12
 [solver]
 method = "quasi-static"
 load_time = 0.1
@@ -39,7 +43,7 @@ frames = 1
 @pytest.mark.parametrize(("cloud", "ranks", "overrides"), [
     ("none", 1, ["hexahedra.hourglass=0.01"]),
     ("core", 2, ["solver.method=dynamic", "support.stabilisation=0", "solver.load_time=0.01"]),
-    ("all", 1, ["solver.method=dynamic-relaxation", "solver.load_steps=70", "displaced.0.rotation=10"]),
+    ("all", 1, ["solver.method=dynamic-relaxation", "solver.load_steps=500", "displaced.0.rotation=10"]),
 ])  # fmt: skip
 def test_a_dry_run_tells_the_terms_that_the_run_takes_and_takes_no_step(tmp_path, cloud, ranks, overrides):
     deck, out = tmp_path / "scene.toml", tmp_path / "out"
@@ -54,7 +58,11 @@ def test_a_dry_run_tells_the_terms_that_the_run_takes_and_takes_no_step(tmp_path
     assert sum(int(row[1]) for row in rows) == report["cells"]["hexahedra"]
     assert sum(int(row[2]) for row in rows) == report["cells"]["support_domains"]
     steps = int(re.search(r"^steps: (\d+)", told, re.M)[1])
-    assert steps == (70 if cloud == "all" else report["steps"])
+    assert steps == (500 if cloud == "all" else report["steps"])
+    size, unit, n = re.search(r"^output: ([0-9.]+) (kB|MB) in (\d+) frames$", told, re.M).groups()
+    with open_result(out) as result:
+        assert result.n_frames == int(n)
+    assert float(size) * {"kB": 1e3, "MB": 1e6}[unit] == pytest.approx((out / "result.vtkhdf").stat().st_size, rel=0.01)
     assert ("of domain_forces and domain_survey: support.stabilisation = 0" in told) == (cloud == "core")
     assert ("pack, clear, unpack: one rank" in told) == (ranks == 1)
     assert ("follow: no node is turned" in told) == (cloud != "all")
@@ -65,6 +73,20 @@ def test_a_dry_run_tells_the_terms_that_the_run_takes_and_takes_no_step(tmp_path
         first = lines.index("left out:") + 1
         assert [f"  {what}" for what in spared] == lines[first : first + len(spared)]
         assert lines[first + len(spared)].startswith("steps:")
+
+
+def test_a_disc_without_room_for_the_result_is_found_before_the_run(tmp_path, monkeypatch):
+    deck, out = tmp_path / "scene.toml", tmp_path / "out"
+    deck.write_text(SCENE.format(cloud="none"))
+    scene = load_deck(deck, ("output.frames=1000",))
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=10**6))
+    with pytest.raises(
+        InputError, match=r"the result of 1001 frames takes 31.5 MB, and 1 MB are free there; lower"
+    ) as e:
+        run(scene, out, World(), quiet=True)
+    assert "\n" not in str(e.value)
+    assert [path.name for path in out.iterdir()] == ["model.h5"]
 
 
 def test_every_kernel_is_either_taken_or_left_out_for_a_reason(tmp_path):

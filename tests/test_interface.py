@@ -95,7 +95,9 @@ def test_json_is_what_the_tables_say(result):
     assert json.loads(mpitled("info", "--json").stdout)["mpitled"] == package.__version__
     checked = json.loads(mpitled("check", CUBE, "--json", "--set", "block.elements=[3,3,3]").stdout)
     assert (checked["hexahedra"], checked["nodes"]["all"]) == (27, 64)
-    assert checked["run"]["loop_s"] == pytest.approx(checked["run"]["steps"] * checked["run"]["step_s"])
+    assert checked["run"]["loop_s"] == pytest.approx(
+        checked["run"]["steps"] * checked["run"]["step_s"] + checked["run"]["surveys"] * checked["run"]["survey_s"]
+    )
 
 
 def test_the_shell_completes_commands_and_keys(tmp_path):

@@ -159,11 +159,13 @@ def read(folder: Path) -> Sweep:
     path = folder / MANIFEST
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
-        values = [case["values"] for case in manifest["cases"]]
-        deck, base, ranks = Path(manifest["deck"]), manifest["overrides"], manifest["ranks"]
+        values = [{str(key): str(value) for key, value in case["values"].items()} for case in manifest["cases"]]
+        deck, base, ranks = Path(manifest["deck"]), [str(text) for text in manifest["overrides"]], manifest["ranks"]
         one_growth = manifest["one_growth"]
+        if type(ranks) is not int or ranks < 1 or type(one_growth) is not bool:
+            raise ValueError(f"{ranks} ranks")
     except FileNotFoundError:
         raise InputError(f"{folder}: holds no sweep; give a deck, or the folder that 'mpitled sweep' wrote") from None
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise InputError(f"{path}: cannot be read; give the deck again with --vary or --cases") from None
     return plan(deck, values, base, ranks, folder, one_growth)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled.errors import InputError
-from mpitled.mesh import Mesh, grid_points, hexahedral_mesh, structured_hexahedra
+from mpitled.mesh import Mesh, check_size, grid_points, hexahedral_mesh, structured_hexahedra
 from mpitled.meshing.cloud import in_millimetres, with_cloud
 from mpitled.meshing.onion import Onion, number
 
@@ -34,7 +34,10 @@ def block_mesh(
     corner, size, shape = np.asarray(block.corner), np.asarray(block.size, float), np.asarray(block.elements, np.int64)
     if block.cloud == "all" and cloud.spacing:
         # The cloud has its boundary nodes from the elements that it replaces: they follow its spacing.
-        shape = np.maximum(np.rint(size / cloud.spacing), 1).astype(np.int64)
+        wanted = np.maximum(np.rint(size / cloud.spacing), 1)
+        check_size(float(wanted.prod()), "cloud.spacing")
+        shape = wanted.astype(np.int64)
+    check_size(float(np.prod(shape, dtype=float)), "block.elements")
     fitted = next((sphere for sphere in spheres if sphere.name == block.fitted), None)
     if fitted:
         places, hexahedra, core = _fitted(size, shape, np.asarray(fitted.centre) - corner, fitted, block.core_share)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mpitled import room
 from mpitled.errors import InputError
 from mpitled.mesh import CORNERS, Mesh, numbered_mesh
 from mpitled.solver.hexahedra import geometry, nodal_sum
@@ -27,6 +28,9 @@ _CANDIDATES = 24  # places per node that darts, Lloyd sweeps and shifts choose f
 _SWEEPS = 3  # of Lloyd; more change nothing, because nodes move from candidate to candidate
 _SAMPLES = 8  # points per direction in a cell that the seed's surface cuts
 _ROUNDS = 24  # of dart throwing, roughly
+# Memory that each node and integration point takes while the cloud is filled, at the least (measured: 3,000 to 6,000).
+_BYTES = 2000
+_COARSER = "ask for fewer"
 _SLIVER = 0.5  # a cut cell with a smaller share outside the seed is merged into its neighbour
 _GAUSS = CORNERS / np.sqrt(3.0)  # exact to degree 3 in each coordinate: volume and first moments of trilinear cells
 
@@ -109,6 +113,8 @@ def fill_void(
     if tumour is not None:
         _check_room(points[boundary], tumour, element_size)
 
+    void = float(volumes_and_centroids(corners)[0].sum())
+    _check_size(corners, void, spacing, cloud.points_per_spacing)
     in_fe = np.zeros(len(points), bool)
     in_fe[hexahedra[~dropped]] = True
     on_boundary = np.zeros(len(points), bool)
@@ -121,7 +127,6 @@ def fill_void(
     inner = scatter(corners, spacing, occupied, cloud.irregularity, np.random.default_rng([cloud.seed, 0]))
     cells = cut(corners, spacing, cloud.points_per_spacing, np.random.default_rng([cloud.seed, 1]))
     volumes, centroids = volumes_and_centroids(cells)
-    void = float(volumes_and_centroids(corners)[0].sum())
     figures = {"void_volume_m3": void, "seed_volume_m3": 0.0}
     if tumour is not None:
         volumes, centroids, sampled = _outside(cells, volumes, centroids, spacing)
@@ -301,9 +306,32 @@ def _seed(cloud: deck.Cloud, tumour: deck.Tumour | None, element_size: float) ->
     radius, centre = tumour.seed_radius, np.asarray(tumour.centre, float)
     # One node per squared spacing; the surface is never coarser than the cloud next to it would be.
     coarsest = min(cloud.growth * radius, largest)
-    n = max(tumour.surface_nodes, int(np.ceil(4 * np.pi * radius**2 / coarsest**2)))
+    wanted = max(tumour.surface_nodes, np.ceil(4 * np.pi * (radius / coarsest) ** 2) if coarsest else np.inf)
+    room.check_memory(
+        _BYTES * wanted, f"cloud.growth, tumour.surface_nodes: ask for {wanted:.3g} nodes on the seed, which", _COARSER
+    )
+    n = int(wanted)
     at_surface = np.sqrt(4 * np.pi * radius**2 / n)
     return centre + radius * on_sphere(n), Spacing(largest, cloud.growth, centre, radius, float(at_surface))
+
+
+def _check_size(corners: NDArray[np.float64], void: float, spacing: Spacing, per_spacing: float) -> None:
+    """InputError if nodes and integration points for cells (n, 8, 3) of that volume (m^3) are too many for the memory.
+
+    No more nodes fit than into a ball of that volume around the seed, where they are densest. Cells that are flat are
+    cut along their edges only, into more parts than their volume asks for.
+    """
+    if spacing.centre is None:
+        nodes = void / spacing.largest**3
+    else:
+        reach = np.cbrt(spacing.radius**3 + void * 3 / (4 * np.pi))
+        r = np.geomspace(spacing.radius, reach, 1000)
+        density = 4 * np.pi * r**2 / spacing.at_distance(r) ** 3
+        nodes = float(((density[1:] + density[:-1]) / 2 * np.diff(r)).sum())
+    cuts = _edges(corners) * max(per_spacing, 1.0) / spacing(corners.mean(axis=1))[:, None]
+    needed = max(nodes * (1 + per_spacing**3), float(np.maximum(cuts, 1).prod(axis=1).sum()))
+    what = f"cloud: makes about {needed:.3g} nodes and integration points, which"
+    room.check_memory(_BYTES * needed, what, f"{_COARSER} by spacing, growth or points_per_spacing")
 
 
 def _ball(radius: float) -> float:

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import zlib
+import gzip
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from mpitled import room
 from mpitled.errors import InputError
-from mpitled.mesh import CORNERS, Mesh
+from mpitled.mesh import CORNERS, Mesh, check_size
 from mpitled.meshing.cloud import fill_void, in_millimetres
 
 if TYPE_CHECKING:
@@ -23,7 +25,12 @@ if TYPE_CHECKING:
 Cells = NDArray[np.bool_]  # (nz, ny, nx), so that x runs fastest in memory and in all numbers
 
 _METRES = {"mm": 1e-3, "unknown": 1e-3, "meter": 1.0, "micron": 1e-6}
-_MOST_CUBES = 1e9  # more is a slip of the unit
+#: Images that are read; what else nibabel knows may lead to other files.
+_SUFFIXES = (".nii", ".nii.gz", ".mgh", ".mgz")
+# Bytes of memory that a voxel, beside its label, and a cube of the grid take while the head is meshed, at the most.
+_VOXEL_BYTES, _CUBE_BYTES = 40, 60
+_INFLATED = 1032  # gzip makes no more of a byte than this
+_MOST_BEFORE = 1 << 24  # bytes of a NIfTI file before its voxels
 _VENTRICLES = ("left_ventricle", "right_ventricle")
 
 
@@ -128,9 +135,8 @@ def label_cells(labels: deck.Labels) -> Head:
     voxels = {name: mask & body for name, mask in voxels.items() if name in _VENTRICLES}
 
     size = labels.element_size
-    n_cubes = body.sum() * image.voxel.prod() / size**3
-    if n_cubes > _MOST_CUBES:
-        raise InputError(f"labels.element_size = {1e3 * size:g} mm: makes {n_cubes:.0e} hexahedra; enlarge it")
+    n_cubes = float(body.sum() * (image.voxel / size).prod())
+    check_size(n_cubes, f"labels.element_size = {1e3 * size:g} mm", "enlarge it")
     grid = _grid(image, body, size)
     shares = {name: box_shares(image, mask, grid) for name, mask in {"solid": body, **voxels}.items()}
     solid, repaired = solid_cells(shares["solid"])
@@ -159,14 +165,23 @@ def read_image(path: Path) -> Image:
         raise InputError(f"{path}: label images need nibabel; install it: pip install 'mpitled[images]'") from error
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; labels.image is a path from the deck's folder")
+    if not path.name.lower().endswith(_SUFFIXES):
+        raise InputError(
+            f"{path}: is not an image of a kind that is read ({', '.join(_SUFFIXES)}); convert it to NIfTI"
+        )
     try:
-        image = nibabel.as_closest_canonical(nibabel.load(path))
+        _check_start(path)
+        image: Any = nibabel.load(path)
+        if len(image.shape) != 3 or 0 in image.shape:
+            raise InputError(f"{path}: has shape {image.shape}, not three dimensions; give one volume of labels")
+        _check_claim(path, image)
+        image = nibabel.as_closest_canonical(image)
         data = np.asarray(image.dataobj)
-    except (nibabel.filebasedimages.ImageFileError, OSError, EOFError, ValueError, zlib.error) as error:
-        reason = " ".join(str(error).split())
+    except InputError:
+        raise
+    except Exception as error:  # nibabel raises what it likes
+        reason = " ".join(str(error).split())[:100] or type(error).__name__
         raise InputError(f"{path}: not an image that can be read ({reason}); give a NIfTI file of labels") from error
-    if data.ndim != 3:
-        raise InputError(f"{path}: has shape {data.shape}, not three dimensions; give one volume of labels")
     if data.dtype.kind not in "iufb":
         raise InputError(f"{path}: voxels of type {data.dtype} are no labels; give a volume of integers")
     if data.dtype.kind == "f" and not (np.isfinite(data).all() and (data == np.round(data)).all()):
@@ -180,13 +195,40 @@ def read_image(path: Path) -> Image:
             f"{path}: its axes are oblique to the scanner's; resample it first, without interpolating the labels "
             "(nibabel.processing.resample_to_output, order=0)"
         )
-    units = getattr(image.header, "get_xyzt_units", lambda: ("mm",))()[0]
-    metre = _METRES[units]
+    try:
+        metre = _METRES[getattr(image.header, "get_xyzt_units", lambda: ("mm",))()[0]]
+    except KeyError:
+        raise InputError(f"{path}: its header has a unit of length that is none; correct it (mm)") from None
     return Image(
         path=path,
         labels=np.ascontiguousarray(data.T).astype(np.int32),
         origin=(corner - edges / 2) * metre,
         voxel=edges * metre,
+    )
+
+
+def _check_start(path: Path) -> None:
+    """InputError if a NIfTI file claims that much lies before its voxels, all of which would be read."""
+    if path.name.lower().endswith((".mgh", ".mgz")):
+        return
+    with gzip.open(path) if path.suffix.lower() == ".gz" else path.open("rb") as file:
+        head = file.read(176)
+    for order in "<>":
+        for size, place, kind in ((348, 108, "f"), (540, 168, "q")):  # NIfTI-1 and NIfTI-2
+            if len(head) == 176 and struct.unpack_from(f"{order}i", head)[0] == size:
+                before = struct.unpack_from(order + kind, head, place)[0]
+                if not 0 <= before <= _MOST_BEFORE:
+                    raise InputError(f"{path}: claims {before:g} bytes before its voxels; write it anew")
+
+
+def _check_claim(path: Path, image: Any) -> None:
+    """InputError if a header claims more voxels than the file can hold, or the memory."""
+    n, kind = float(np.prod(image.shape, dtype=float)), image.get_data_dtype()
+    packed = path.suffix.lower() in (".gz", ".mgz")
+    if n * kind.itemsize > path.stat().st_size * (_INFLATED if packed else 1):
+        raise InputError(f"{path}: claims {n:.3g} voxels and has {path.stat().st_size} bytes; write it anew")
+    room.check_memory(
+        n * (2 * max(kind.itemsize, 8) + _VOXEL_BYTES), f"{path}: its {n:.3g} voxels", "cut it to the head"
     )
 
 
@@ -250,7 +292,11 @@ def _grid(image: Image, body: Cells, size: float) -> Grid:
         low[i] = image.origin[i] + image.voxel[i] * occupied[0]
         high[i] = image.origin[i] + image.voxel[i] * (occupied[-1] + 1)
     # Two layers more than the body needs: repairs may add to it, and the outside must stay in one piece.
-    n = np.ceil((high - low) / size - 1e-9).astype(int) + 4
+    wanted = np.ceil((high - low) / size - 1e-9) + 4
+    overlaps = (wanted * image.labels.shape[::-1]).sum()  # see box_shares
+    what = f"labels.element_size = {1e3 * size:g} mm: a grid of {wanted.prod():.3g} cubes"
+    room.check_memory(_CUBE_BYTES * (wanted.prod() + overlaps), what, "enlarge it")
+    n = wanted.astype(int)
     return Grid((low + high) / 2 - size * n / 2, size, (int(n[0]), int(n[1]), int(n[2])))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled.errors import InputError
-from mpitled.mesh import Mesh, hexahedral_mesh
+from mpitled.mesh import Mesh, check_size, hexahedral_mesh
 from mpitled.meshing.cloud import in_millimetres, with_cloud
 from mpitled.meshing.onion import Onion, graded, number, on_sphere
 
@@ -32,6 +32,7 @@ def cylinder_mesh(cylinder: deck.Cylinder, cloud: deck.Cloud, tumour: deck.Tumou
     if tumour is not None and cylinder.cloud == "none":
         raise InputError('cylinder.cloud = "none": a tumour grows in a cloud; set it to "core" or "all"')
     size = _element_size(cylinder, cloud)
+    check_size((np.pi * (cylinder.radius / size) ** 2 + 1) * (cylinder.height / size + 1), "cylinder.element_size")
     n = 2 * number(_ACROSS * cylinder.radius / (2 * size))
     # In a cloud there are no layers, and nodes on its surface should lie as those in it: evenly.
     grading = 1.0 if cylinder.cloud == "all" else cylinder.grading
@@ -63,8 +64,13 @@ def ellipsoid_mesh(ellipsoid: deck.Ellipsoid, cloud: deck.Cloud, tumour: deck.Tu
     InputError for a tumour without room.
     """
     axes, size = np.asarray(ellipsoid.semi_axes), _element_size(ellipsoid, cloud)
+    # The core, and the shells around it.
+    across = _ACROSS * axes / size + 4
+    shells = axes.prod() ** (1 / 3) / size * 2 * (across * np.roll(across, 1)).sum()
+    check_size(float(across.prod() + shells) / 4, "ellipsoid.element_size")
     shape = np.array([4 * number(_ACROSS * a / (4 * size)) for a in axes])
     if tumour is not None and ellipsoid.cloud == "none" and ellipsoid.cavity == "fitted":
+        check_size((tumour.surface_nodes / 6) ** 1.5, "tumour.surface_nodes")
         shape = np.maximum(shape, 4 * number(np.ceil((tumour.surface_nodes / 6) ** 0.5 / 4)))
     grading = 1.0 if ellipsoid.cloud == "all" else ellipsoid.grading
     onion = Onion(tuple(shape), float(axes.prod() ** (1 / 3)), size, grading, lines=grading)
@@ -139,6 +145,7 @@ def _fitted(
     even = max(element_size / growth, seed)  # from this distance on shells are equally thick
     ends = np.log(np.minimum(reach, even) / seed) / growth + np.maximum(reach - even, 0) / (growth * even)
     n = number(np.ceil(ends.mean()))
+    check_size(float(n) * len(onion.faces), "ellipsoid.element_size")
     place = ends * np.arange(n + 1)[:, None] / n  # (shells, lines), in thicknesses
     turn = np.log(even / seed) / growth
     radius = np.where(

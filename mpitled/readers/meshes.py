@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mpitled import store
 from mpitled.errors import InputError
 from mpitled.material import Material
 from mpitled.mesh import METRES, Constraint, Mesh
@@ -76,6 +78,7 @@ def files(section: deck.MeshFiles) -> list[Path]:
 def _reader(path: Path) -> tuple[Callable[[Path], MeshFile], Callable[[Path], list[Path]]]:
     """The reader of a file, and the function that says what it includes; chosen by name and contents."""
     try:
+        meshfile.check_file(path, "a mesh")
         with path.open("rb") as file:
             head = file.read(1 << 16)
     except OSError as error:
@@ -98,12 +101,33 @@ def _read_with_meshio(path: Path) -> MeshFile:
         raise InputError(
             f"{path}: is no mesh that is known; give an Abaqus or LS-DYNA deck, or {', '.join(_some_suffixes())} ..."
         )
+    _check_hdf5(path)
     try:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()) as said:
-            mesh = meshio.read(path)
-    except (Exception, SystemExit) as error:  # meshio raises what it likes, and exits
+            return _of_meshio(meshio.read(path), path)
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:  # meshio raises what it likes, exits, and returns what does not fit
         reason = " ".join((str(error) if not isinstance(error, SystemExit) else said.getvalue()).split())[:100]
         raise InputError(f"{path}: cannot be read by meshio ({reason or type(error).__name__}); correct it") from None
+
+
+def _check_hdf5(path: Path) -> None:
+    """InputError if a file that is HDF5, or names some as XDMF does, would have meshio led elsewhere."""
+    with path.open("rb") as file:
+        head = file.read(8)
+    if head == b"\x89HDF\r\n\x1a\n":
+        store.check_hdf5(path)
+    elif path.suffix.lower() in (".xdmf", ".xmf"):
+        text = meshfile.decoded(meshfile.read_text(path, "a mesh (XDMF)"))
+        for name in sorted(set(re.findall(r"([^<>\s]+):/", text))):
+            beside = path.parent / name
+            if Path(name).name != name or not beside.is_file():
+                raise InputError(f"{path}: its data are in {name}, which is not beside it; put it there")
+            store.check_hdf5(beside)
+
+
+def _of_meshio(mesh: Any, path: Path) -> MeshFile:
     points = np.asarray(mesh.points, float)
     if points.ndim != 2 or not 1 < points.shape[1] < 4:
         raise InputError(f"{path}: has nodes that are no places in space; correct it")
@@ -135,20 +159,26 @@ def _meshio_sets(mesh: Any, file: MeshFile) -> None:
     """Sets by name, physical groups of gmsh, families of MED, and integer fields with few values."""
     ends = np.cumsum([0, *(len(block.ids) for block in file.cells)])
     for name, members in mesh.point_sets.items():
-        meshfile.add_set(file.node_sets, name, np.unique(np.asarray(members, np.int64)))
+        meshfile.add_set(file.node_sets, name, _rows(members, len(file.points), name, file))
     for name, blocks in mesh.cell_sets.items():
         if not name.startswith("gmsh:"):
-            own = [start + np.asarray(b, np.int64) for start, b in zip(ends, blocks, strict=False) if b is not None]
+            own = [
+                start + _rows(rows, len(block.ids), name, file)
+                for start, rows, block in zip(ends, blocks, file.cells, strict=False)
+                if rows is not None
+            ]
             meshfile.add_set(file.cell_sets, name, np.unique(np.concatenate([np.empty(0, np.int64), *own])))
-    groups = {int(tag): name for name, (tag, _) in getattr(mesh, "field_data", {}).items()}
+    # Of gmsh: a tag and a dimension. What others keep there is no group.
+    fields = getattr(mesh, "field_data", {}).items()
+    groups = {int(np.ravel(pair)[0]): name for name, pair in fields if _is_group(pair)}
     cell_fields = {
         name: np.concatenate([np.empty(0, np.int64), *map(np.ravel, parts)]) for name, parts in mesh.cell_data.items()
     }
-    for fields, families, sets, size in (
+    for data_fields, families, sets, size in (
         (mesh.point_data, getattr(mesh, "point_tags", {}), file.node_sets, len(file.points)),
         (cell_fields, getattr(mesh, "cell_tags", {}), file.cell_sets, file.n_cells),
     ):
-        for name, data in fields.items():
+        for name, data in data_fields.items():
             values: NDArray[Any] = np.asarray(data)
             if (
                 values.dtype.kind not in "iu"
@@ -167,6 +197,18 @@ def _meshio_sets(mesh: Any, file: MeshFile) -> None:
                     names = [f"{name} {value}"]
                 for chosen in names:
                     sets[chosen] = np.union1d(sets.get(chosen, np.empty(0, np.int64)), rows)
+
+
+def _rows(rows: Any, end: int, name: str, file: MeshFile) -> NDArray[np.int64]:
+    """A set's rows, ascending. InputError if there are no such rows."""
+    found = np.unique(np.asarray(rows, np.int64))
+    if len(found) and not 0 <= found[0] <= found[-1] < end:
+        raise InputError(f"{file.path}: the set '{name}' has members that the file does not define; correct it")
+    return found
+
+
+def _is_group(pair: Any) -> bool:
+    return not isinstance(pair, str | list | dict) and np.shape(pair) == (2,) and np.asarray(pair).dtype.kind in "iu"
 
 
 # --- one file ------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mpitled import room
 from mpitled.errors import InputError
 from mpitled.mesh import Constraint
 
@@ -155,9 +156,18 @@ def decoded(text: bytes) -> str:
         return text.decode("latin-1")
 
 
+def check_file(path: Path, what: str) -> None:
+    """InputError if it is a device or a pipe, which may have no end."""
+    if not path.is_file() and not path.is_dir() and path.exists():
+        raise InputError(f"{path}: is a device or a pipe; give the path of {what}")
+
+
 def read_text(path: Path, what: str) -> bytes:
     """The bytes of a text file with lines that end in LF. InputError if it is missing, empty or not text."""
     try:
+        check_file(path, what)
+        # A text's numbers, nodes, cells and sets take more than the text itself.
+        room.check_memory(4 * path.stat().st_size, f"{path}: to read it", "use a machine with more")
         text = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}; give the path of {what}") from None

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
+import re
+import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mpitled import store
-from mpitled.errors import InputError
+from mpitled import room, store
+from mpitled.errors import InputError, damaged
 from mpitled.model import Model
 from mpitled.preprocess import OUTER
+from mpitled.readers import meshfile
+from mpitled.readers.meshfile import FARTHEST
 from mpitled.results import field
 from mpitled.results.field import Field
 
@@ -183,18 +188,29 @@ def _of_result(path: Path) -> Reference:
 
 
 def _of_npz(path: Path, ours: Field) -> Reference:
+    names = ("X", "u", "err_u", "tag", "meta")
     try:
-        with np.load(path) as arrays:
-            data = {name: arrays[name] for name in ("X", "u", "err_u", "tag", "meta") if name in arrays}
-        meta = json.loads(str(data.pop("meta", "{}")))
-    except (OSError, ValueError) as problem:
-        raise InputError(f"{path}: cannot be read as .npz ({problem})") from None
+        with zipfile.ZipFile(path) as archive:
+            # What is packed may be a thousand times what is in the file.
+            size = sum(member.file_size for member in archive.infolist() if member.filename[:-4] in names)
+        room.check_memory(4 * size, f"{path}: its arrays", "give fewer places")
+        with np.load(path, allow_pickle=False) as arrays:
+            data = {name: np.asarray(arrays[name]) for name in names if name in arrays}
+        meta = dict(json.loads(str(data.pop("meta", "{}"))))
+        radii = np.asarray(meta.get("R", []), float)
+        if any(values.dtype.kind not in "fiub" for values in data.values()):
+            raise ValueError("it holds other than numbers")
+    except InputError:
+        raise
+    except Exception as problem:  # of zip and numpy, which raise what they like
+        reason = " ".join(str(problem).split())[:100] or type(problem).__name__
+        raise InputError(f"{path}: cannot be read as .npz ({reason}); write it anew with numpy.savez") from None
     if "X" not in data or "u" not in data:
         raise InputError(f"{path}: has no X and u; give places (n, 3) and displacements (n, 3) under these names")
     u, error = data["u"], data.get("err_u")
     if u.ndim == 3:
-        row = _row(path, np.asarray(meta.get("R", []), float), len(u), ours)
-        u, error = u[row], None if error is None else error[row]
+        row = _row(path, radii, len(u), ours)
+        u, error = u[row], error[row] if error is not None and error.shape[:1] == radii.shape else error
     return _checked(path, Reference(data["X"], u, error, data.get("tag")))
 
 
@@ -213,7 +229,8 @@ def _row(path: Path, radii: NDArray[np.float64], n: int, ours: Field) -> int:
 
 
 def _of_csv(path: Path) -> Reference:
-    with path.open(newline="", encoding="utf-8-sig") as file:
+    file = io.StringIO(meshfile.decoded(meshfile.read_text(path, "a table of places and displacements (CSV)")))
+    with damaged(path, "give x, y, z, ux, uy, uz in each line"):
         rows = csv.reader(file)
         names = [name.strip() for name in next(rows, [])]
         missing = [name for name in ("x", "y", "z", "ux", "uy", "uz") if name not in names]
@@ -240,6 +257,8 @@ def _of_vtk(path: Path) -> Reference:
         from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
     except ImportError:
         raise InputError(f"{path}: to read it, install vtk: pip install vtk") from None
+    if path.suffix == ".vtu":
+        _check_vtu(path)
     reader: Any = vtkXMLUnstructuredGridReader() if path.suffix == ".vtu" else vtkHDFReader()
     reader.SetFileName(str(path))
     if path.suffix == ".vtkhdf":
@@ -258,6 +277,16 @@ def _of_vtk(path: Path) -> Reference:
     return _checked(path, Reference(places, u))
 
 
+def _check_vtu(path: Path) -> None:
+    """InputError if an XML file claims more points or cells than its bytes can make: VTK takes room for them first."""
+    content = path.read_bytes()
+    claims = [int(n) for n in re.findall(rb'NumberOf(?:Points|Cells|Tuples|Components)\s*=\s*["\'](\d{1,18})', content)]
+    if max(claims, default=0) > 1000 * len(content) or re.search(rb'NumberOf\w+\s*=\s*["\']\s*[+-]?\d{19}', content):
+        raise InputError(
+            f"{path}: claims {max(claims, default=0)} points or cells in {len(content)} bytes; write it anew"
+        )
+
+
 def _checked(path: Path, reference: Reference) -> Reference:
     """The reference in float64, or an InputError if its arrays do not fit each other."""
     n = len(reference.places)
@@ -265,6 +294,8 @@ def _checked(path: Path, reference: Reference) -> Reference:
         array = getattr(reference, name)
         if array is not None and (array.shape != shape or not np.isfinite(array).all()):
             raise InputError(f"{path}: {name} has shape {array.shape} for {n} places, or numbers that are not finite")
+    if not (np.abs(reference.places) < FARTHEST).all() or not (np.abs(reference.displacement) < FARTHEST).all():
+        raise InputError(f"{path}: has places or displacements beyond {FARTHEST:g} m; correct them")
     if n == 0:
         raise InputError(f"{path}: has no places")
     tag = None if reference.tag is None else reference.tag.astype(np.int64)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpitled import store
-from mpitled.errors import InputError
+from mpitled.errors import InputError, damaged
 from mpitled.mesh import CORNERS
 from mpitled.meshing.cloud import FACES, boundary_faces
 from mpitled.model import Model
@@ -90,7 +90,7 @@ def open_field(path: Path, frame: int = -1) -> Field:
 
     InputError if one of the two files is missing or they are not of one run.
     """
-    with store.open_result(path) as result:
+    with store.open_result(path) as result, damaged(result.path, "run the deck again"):
         model = store.read_model(result.path.parent / "model.h5")
         if not np.array_equal(result.node_points, model.points):
             raise InputError(f"{result.path}: is not a result of the model beside it; run the deck again")

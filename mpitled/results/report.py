@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled import atomic, store
-from mpitled.errors import InputError
+from mpitled.errors import InputError, damaged
 from mpitled.meshing.cloud import boundary_faces, interface_faces
 from mpitled.model import Model
 from mpitled.solver import hexahedra
@@ -94,7 +94,7 @@ def read(directory: Path) -> Outcome:
     """The last frame of the run in a directory, and its model; errors as `write`."""
     if not directory.is_dir():
         raise InputError(f"{directory}: is no folder; give the one that 'mpitled run' wrote")
-    with store.open_result(directory) as result:
+    with store.open_result(directory) as result, damaged(result.path, "run the deck again"):
         if result.n_frames == 0:
             raise InputError(f"{result.path}: holds no frame yet; run the deck again")
         model = store.read_model(directory / MODEL)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 import partition
 from mpitled import deck as decks
-from mpitled import store
+from mpitled import room, store
 from mpitled.deck import Deck
 from mpitled.errors import InputError, InterruptedRun, MpitledError, UnstableError
 from mpitled.loading import sphere_radius
@@ -246,8 +246,19 @@ class _Run:
 
     # ------------------------------------------------------------ the loop
 
+    @property
+    def output_bytes(self) -> int:
+        """Size of the result."""
+        return store.result_bytes(self.sub.rows, self.deck.output.frames + 1)
+
+    def _check_disc(self) -> None:
+        what = f"the result of {self.deck.output.frames + 1} frames"
+        needed = self.output_bytes - store.unfinished_bytes(self.directory)
+        room.check_disc(needed, self.directory, what, "lower output.frames, or give another folder")
+
     def run(self, interrupts: Interrupts) -> dict[str, Any]:
         self.interrupts = interrupts
+        on_leader(self.world, self._check_disc)
         with self.phases("compile"):
             self.warm_up()
         with self.phases("begin"), everywhere():

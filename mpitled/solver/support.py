@@ -11,6 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mpitled import room
 from mpitled.errors import InputError
 from mpitled.solver.coarse import AffineGrid, solve
 from mpitled.solver.hexahedra import nodal_sum
@@ -56,6 +57,10 @@ def find_domains(
     domains nearest to it, the place of their farthest node that can spare one. n is the same in every domain.
     InputError if there are too few nodes.
     """
+    if len(at) and n > len(points):
+        raise InputError(f"support.nodes = {n}: is more than the {len(points)} nodes that there are; lower it")
+    # Numbers, values and gradients of each node of each domain, and as much again while they are found.
+    room.check_memory(80.0 * len(at) * n, f"support.nodes = {n}: in each of {len(at)} domains", "lower it")
     domains = np.empty((len(at), n), np.int64)
     limited = 0
     tree = cKDTree(points)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 import textwrap
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import partial
@@ -14,16 +12,14 @@ from typing import Any
 import numpy as np
 
 from mpitled import deck as decks
+from mpitled import room
 from mpitled.deck import Deck
 from mpitled.solver import run as runs
 from mpitled.solver.halo import World
 from mpitled.solver.march import March
 from mpitled.solver.subdomain import SHORTEST_RUN, Subdomain
-from mpitled.speed.forecast import first_rank
+from mpitled.speed import forecast
 from mpitled.speed.witness import Call, distinct_bytes, witness
-
-#: Times that each term is called to tell how long it takes; the fastest counts, for others may use the machine too.
-CALLS = 9
 
 
 def dry_run(deck: Deck, directory: Path, world: World) -> str:
@@ -38,8 +34,8 @@ def dry_run(deck: Deck, directory: Path, world: World) -> str:
     method, sub = run.method, run.sub
     terms = [(name, partial(act, method.state)) for name, act in (*method.forces, *method.motion)]
     calls, surveyed = witness(terms), witness([("survey", method.look)])
-    seconds = {name: _seconds(act) for name, act in terms}
-    step, survey = sum(seconds.values()), _seconds(method.look)
+    seconds, survey = forecast.measure(method)
+    step = sum(seconds.values())
     counts = [len(sub.rows.hexahedra), len(sub.rows.domains), sub.n_nodes, sum(len(nodes) for _, nodes in sub.shared)]
     sizes = [distinct_bytes(calls) / sub.n_cells, _held_bytes(method) / sub.n_cells]
     table = world.gather([*counts, *sizes, 1e3 * step, 1e3 * survey])
@@ -61,15 +57,6 @@ def dry_run(deck: Deck, directory: Path, world: World) -> str:
     return str(
         world.broadcast("\n".join([*lines, *_forecast(run, table[:, -2].max() / 1e3, table[:, -1].max() / 1e3)]))
     )
-
-
-def _seconds(act: Callable[[], object]) -> float:
-    seconds = []
-    for _ in range(CALLS):
-        begin = time.perf_counter()
-        act()
-        seconds.append(time.perf_counter() - begin)
-    return min(seconds)
 
 
 def _told(calls: Sequence[Call], surveyed: Sequence[Call], seconds: dict[str, float]) -> list[str]:
@@ -94,7 +81,7 @@ def _kernels(calls: Sequence[Call]) -> list[str]:
 def left_out(directory: Path, metadata: Mapping[str, Any]) -> list[str]:
     """What the run in a directory, whose result records this of it, did without on rank 0, as `dry_run` tells it."""
     deck, ranks = decks.recorded(metadata["deck"], directory), metadata["ranks"]
-    sub, method = first_rank(deck, directory / runs.MODEL, ranks)
+    sub, method = forecast.first_rank(deck, directory / runs.MODEL, ranks)
     return _left_out(deck, sub, ranks, witness([("all", method.warm_up)]))
 
 
@@ -203,10 +190,10 @@ def _forecast(run: Any, step: float, survey: float) -> list[str]:
     else:
         length = " of load"
         more = f"; then as many as come within {1e3 * method.tolerance:g} mm of rest, about as many again"
-    n = method.expected_steps
-    n_surveys = math.ceil(n / method.between)
+    expected = forecast.expect(method, step, survey, run.output_bytes)
     return [
-        f"steps: {n}{length}, {n_surveys} surveys{more}",
-        f"loop: {n * step + n_surveys * survey:.3g} s on the slowest rank ({1e3 * step:.3g} ms a step, "
-        f"{1e3 * survey:.3g} ms a survey: the fastest of {CALLS} calls on this machine)",
+        f"steps: {expected.steps}{length}, {expected.surveys} surveys{more}",
+        f"loop: {expected.loop_s:.3g} s on the slowest rank ({1e3 * step:.3g} ms a step, "
+        f"{1e3 * survey:.3g} ms a survey: the fastest of {forecast.CALLS} calls on this machine)",
+        f"output: {room.told(run.output_bytes)} in {run.deck.output.frames + 1} frames",
     ]

@@ -1,13 +1,16 @@
-"""What a run will take on one rank of this machine: its steps, and the time of one, measured on the model itself."""
+"""What a run will take: steps and surveys, the time of each, measured on the model itself, and room on the disc."""
 
 from __future__ import annotations
 
+import math
 import tempfile
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from mpitled import store
+from mpitled import room, store
 from mpitled.deck import Deck
 from mpitled.model import Model
 from mpitled.solver.halo import World
@@ -16,39 +19,53 @@ from mpitled.solver.relaxation import Relaxation
 from mpitled.solver.run import PRECISIONS
 from mpitled.solver.subdomain import Subdomain, localise
 
-_MEASURED = 0.3  # s of steps, and three of them at least
+#: Times that each term is called to tell how long it takes; the fastest counts, for others may use the machine too.
+CALLS = 9
 
 
 class Forecast(NamedTuple):
-    """Steps and times of the loop; building, pictures and a ramp's distance to rest come on top."""
+    """Steps and times of the loop, and the result's size; building, pictures and a ramp's way to rest come on top."""
 
     steps: int
+    surveys: int
     at_least: bool  # whether the method goes on until it is at rest, which nobody knows beforehand
     step_s: float
-    loop_s: float
+    survey_s: float
+    output_bytes: int
+
+    @property
+    def loop_s(self) -> float:
+        return self.steps * self.step_s + self.surveys * self.survey_s
 
     def describe(self) -> str:
         """In a line."""
         least = "at least " if self.at_least else ""
-        return f"{least}{self.steps} steps of {1e3 * self.step_s:.2g} ms: {least}{self.loop_s:.2g} s on one rank here"
+        steps = f"{least}{self.steps} steps of {1e3 * self.step_s:.2g} ms: {least}{self.loop_s:.2g} s on one rank here"
+        return f"{steps}; {room.told(self.output_bytes)} of results"
+
+
+def measure(method: March | Relaxation) -> tuple[dict[str, float], float]:
+    """Seconds that each term of a step takes on the state that the method has, and those of a survey."""
+    terms = {name: partial(act, method.state) for name, act in (*method.forces, *method.motion)}
+    return {name: _fastest(act) for name, act in terms.items()}, _fastest(method.look)
+
+
+def expect(method: March | Relaxation, step: float, survey: float, output_bytes: int) -> Forecast:
+    """What a method that is ready to begin will take, at so many seconds a step and a survey."""
+    n = method.expected_steps
+    return Forecast(n, math.ceil(n / method.between), isinstance(method, Relaxation), step, survey, output_bytes)
 
 
 def forecast(deck: Deck, model: Model) -> Forecast:
-    """Takes a few steps at rest. InputError if the deck's step is too long for the model."""
+    """What a run takes on one rank of this machine. InputError if the deck's step is too long for the model."""
     with tempfile.TemporaryDirectory() as folder:  # ranks read their part from a file, and so does this one
         path = Path(folder) / "model.h5"
         store.write_model(path, model, "")
-        _, method = first_rank(deck, path)
+        sub, method = first_rank(deck, path)
     method.warm_up()
     method.begin()
-    steps = method.expected_steps
-    taken, begin = 0, time.perf_counter()
-    while taken < 3 or time.perf_counter() - begin < _MEASURED:
-        for _, term in (*method.motion[-1:], *method.forces, *method.motion[:-1]):
-            term(method.state)
-        taken += 1
-    each = (time.perf_counter() - begin) / taken
-    return Forecast(steps, isinstance(method, Relaxation), each, steps * each)
+    seconds, survey = measure(method)
+    return expect(method, sum(seconds.values()), survey, store.result_bytes(sub.rows, deck.output.frames + 1))
 
 
 def first_rank(deck: Deck, path: Path, ranks: int = 1) -> tuple[Subdomain, March | Relaxation]:
@@ -60,3 +77,12 @@ def first_rank(deck: Deck, path: Path, ranks: int = 1) -> tuple[Subdomain, March
     if solver.method == "dynamic-relaxation":
         return sub, Relaxation(solver, frames, sub, world, None, None)
     return sub, March(solver, frames, sub, world, None, None, figures)
+
+
+def _fastest(act: Callable[[], object]) -> float:
+    seconds = []
+    for _ in range(CALLS):
+        begin = time.perf_counter()
+        act()
+        seconds.append(time.perf_counter() - begin)
+    return min(seconds)

@@ -84,7 +84,7 @@ def _deck(deck: Deck) -> Iterator[Item]:
     n, of = len(model.prescribed_dofs), 3 * model.n_nodes
     yield Item("prescribed dofs", f"{n} of {of}", n)
     expected = forecast.forecast(deck, model)
-    yield Item("run", expected.describe(), expected._asdict())
+    yield Item("run", expected.describe(), expected._asdict() | {"loop_s": expected.loop_s})
     yield from _remarks(plausible(deck))
     yield from _remarks(model.remarks)
 

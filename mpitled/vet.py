@@ -1,0 +1,74 @@
+"""What an HDF5 file of a stranger may be, seen before any of it is read.
+
+HDF5 follows links and storage into other files, and takes room for what a file claims to hold. So every link must be a
+hard one, every dataset lie in the file itself, and none claim more than its bytes can make.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mpitled.errors import InputError
+
+#: Objects in a file; ours have some tens.
+MOST_OBJECTS = 10_000
+#: Deflate, the strongest of the filters, makes no more of a byte than this.
+_INFLATED = 1032
+_HARD = 0  # H5L_TYPE_HARD
+#: Filters of HDF5 and h5py themselves: deflate, shuffle, fletcher32, szip, nbit, scale-offset, LZF.
+_FILTERS = {1, 2, 3, 4, 5, 6, 32000}
+
+
+def check_file(file: Any, path: Path, *, numbers: bool = False) -> None:
+    """Look at every object of an open h5py.File; `numbers`: of fixed-length numbers and text alone. InputError."""
+    room, todo, seen = path.stat().st_size, [file["/"]], {file["/"]}
+    n_objects = 0
+    while todo:
+        group = todo.pop()
+        for name in group:
+            n_objects += 1
+            if n_objects > MOST_OBJECTS:
+                raise InputError(f"{path}: has more than {MOST_OBJECTS} objects; it is not read")
+            item = member(group, name, path)
+            if item in seen:
+                continue
+            seen.add(item)
+            if hasattr(item, "keys"):
+                todo.append(item)
+            elif hasattr(item, "shape"):
+                room -= check_dataset(item, path)
+                if numbers and item.dtype.kind not in "fiuSb":
+                    raise InputError(f"{path}: {item.name} holds other than numbers and text; it is not read")
+    # Each may be as large as the file, but not all of them.
+    if room < 0:
+        raise InputError(f"{path}: claims to hold more than its {path.stat().st_size} bytes; write it anew")
+
+
+def member(group: Any, name: str, path: Path) -> Any:
+    """A group or dataset of a group, if it is there by a hard link. InputError."""
+    if group.id.links.get_info(name.encode()).type != _HARD:
+        raise InputError(f"{path}: {name} is a link that leads elsewhere; it is not followed: copy the data in")
+    return group[name]
+
+
+def check_dataset(dataset: Any, path: Path) -> int:
+    """See that a dataset lies in its file and claims no more than its bytes can make; these. InputError."""
+    if dataset.is_virtual or dataset.external:
+        raise InputError(f"{path}: the data of {dataset.name} are in another file; it is not read: copy them in")
+    properties, stored = dataset.id.get_create_plist(), dataset.id.get_storage_size()
+    filters = {properties.get_filter(i)[0] for i in range(properties.get_nfilters())}
+    if not filters <= _FILTERS:
+        raise InputError(f"{path}: {dataset.name} is packed by a filter that is not known; write it without")
+    if dataset.shape is None:  # an empty dataset
+        return int(stored)
+    claimed = dataset.dtype.itemsize
+    for n in dataset.shape:
+        claimed *= n
+    chunk = dataset.dtype.itemsize if dataset.chunks else 0
+    for n in dataset.chunks or ():
+        chunk *= n
+    most = stored * (_INFLATED if filters - {2, 3} else 1)
+    if stored > path.stat().st_size or claimed > most or (filters and claimed and chunk > most):
+        raise InputError(f"{path}: {dataset.name} claims {claimed} bytes, and {stored} are there; write the file anew")
+    return int(stored)
