@@ -22,7 +22,7 @@ def test_a_new_deck_can_be_computed_as_it_is_and_tells_the_defaults(tmp_path, ki
     assert scaffold.write(kind, path)[0] == path
     said = overview.figures(path)
     assert said["hexahedra"] > 0
-    assert said["run"]["steps"] > 100
+    assert said["run"]["steps"] >= 50  # those in which relaxation loads at least
     assert not [remark for remark in said["remarks"] if "warning" in remark]
     text = path.read_text()
     shown = re.sub(r"^# (\w+ = .)", r"\1", text, flags=re.MULTILINE)

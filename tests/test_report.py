@@ -318,7 +318,7 @@ def test_info_of_the_machine_and_of_files(grown):
         assert any(line.startswith(name) for line in printed.splitlines())
     assert importlib.metadata.version("numba") in printed
     assert "a whole result" in mpitled("info", grown[0] / "result.vtkhdf").stdout
-    assert "a model" in mpitled("info", grown[0] / "model.h5").stdout
+    assert "a whole model" in mpitled("info", grown[0] / "model.h5").stdout
     assert "folder" in complaint(mpitled("info", grown[0], status=2))
     assert "report.json" in complaint(mpitled("info", grown[0] / "report.json", status=2))
 
