@@ -24,7 +24,7 @@ def table():
 
 def test_a_scene_in_the_table(table, tmp_path, monkeypatch, capsys):
     """The confined cube's compression is homogeneous, so that every mesh has it to what relaxation leaves."""
-    confined = ("block.elements=[3,3,3]", "fixed.0.nodes=surface", "fixed.1.nodes=surface")
+    confined = ("block.elements=[3,3,3]", "fixed.0.nodes=surface", "fixed.1.nodes=surface", "solver.load_steps=500")
     cube = table.Scene(
         "cube", "cube", "E3_cube_strain_50", 0, 0.02, confined, (1.0, 2.0, 3.0), "block", "block.elements=[4,4,4]"
     )
