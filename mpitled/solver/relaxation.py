@@ -189,6 +189,7 @@ class Relaxation:
             self.lowest = known
             frequency = math.sqrt(known)
             self.distance = max(figures["change"] / frequency, figures["residual"] / known)
+            steady = steady or self.distance < 1e-6 * self.tolerance  # round-off, whose quotient is no eigenvalue
             self.settled = self.settled + self.between if steady and self.distance < self.tolerance else 0
         damping = 2 * math.sqrt(self.lowest)
         s.retain, s.gain = (2 - damping) / (2 + damping), 2 / (2 + damping)
