@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -96,6 +97,7 @@ def _output(options: argparse.Namespace) -> Path:
 def _run(options: argparse.Namespace) -> None:
     from mpitled.deck import load_deck
     from mpitled.solver.halo import World
+    from mpitled.solver.progress import INTERRUPTS
     from mpitled.solver.run import everywhere, run
 
     world = World()
@@ -110,6 +112,8 @@ def _run(options: argparse.Namespace) -> None:
         if world.leads:
             print(told)
         return
+    for which in INTERRUPTS:  # what comes after the end of the run must not make a failure of it
+        signal.signal(which, signal.SIG_IGN)
     made = run(deck, _output(options), world, quiet=options.quiet, resume=options.resume)
     if world.leads and options.quiet:
         for text in made["warnings"]:

@@ -18,7 +18,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -161,6 +162,7 @@ class Faults:
     def __init__(self, top: Path, seed: int = 0) -> None:
         self.top, self.rng, self.rows = top, random.Random(seed), list[tuple[str, str, int, int]]()
         (top / "scene.toml").write_text(SCENE)
+        self.killed = 0
         self._whole: dict[int, tuple[np.ndarray, ...]] = {}
         self._models: dict[int, Path] = {}
 
@@ -221,17 +223,18 @@ class Faults:
             )
             assert apart < TOLERANCE * largest, f"{apart / largest:.1e} apart"
 
-    def tried(self, fault: str, phases: str, attempts: list[Callable[[], None]]) -> None:
+    def tried(self, fault: str, phases: str, attempts: Iterable[Callable[[], None]]) -> None:
         """Try, and enter in the table how often it was survived."""
-        survived = 0
+        survived = count = 0
         for attempt in attempts:
+            count += 1
             try:
                 attempt()
                 survived += 1
             except (AssertionError, InputError) as error:
                 print(f"{fault}, {phases}: {error}", file=sys.stderr)
-        self.rows.append((fault, phases, survived, len(attempts)))
-        print(f"{fault}, {phases}: {survived} of {len(attempts)}", file=sys.stderr, flush=True)
+        self.rows.append((fault, phases, survived, count))
+        print(f"{fault}, {phases}: {survived} of {count}", file=sys.stderr, flush=True)
 
     def table(self) -> str:
         rows = [f"| {fault} | {phases} | {survived} of {tried} |" for fault, phases, survived, tried in self.rows]
@@ -256,6 +259,7 @@ class Faults:
             job.kill(self.rng.randrange(ranks))
             begin = time.monotonic()
             status = job.end(60)
+            self.killed += status != 0  # and not at its end before
             assert time.monotonic() - begin < GONE or status == 0, f"gone after {time.monotonic() - begin:.0f} s"
             said = any("exited on signal 9" in line for line in job.lines)  # by mpirun; alone a rank cannot
             assert status == 0 or said or ranks == 1, f"no true message: {job.lines[-5:]}"
@@ -266,10 +270,12 @@ class Faults:
         folder = self.folder("signalled", ranks)
         job = Job(folder, ranks)
         assert job.reaches("loop")
-        time.sleep(self.rng.uniform(0, 1))
+        time.sleep(self.rng.uniform(0, 0.6))
         job.process.send_signal(which)
         status = job.end(GONE)
-        if which == signal.SIGUSR1:
+        if which == signal.SIGUSR1 and (folder / "result.vtkhdf").exists():
+            assert status in (0, 4), f"status {status}"  # it was done, but for the report
+        elif which == signal.SIGUSR1:
             assert status == 4, f"status {status}"
             assert "interrupted" in job.message, job.message
             assert store.checkpoint_contents(folder / store.CHECKPOINTS[0])["ranks"] == ranks
@@ -336,13 +342,20 @@ class Faults:
     def cut(self, path: Path) -> None:
         path.write_bytes(path.read_bytes()[: self.rng.randrange(path.stat().st_size)])
 
-    def disc_full(self, kilobytes: int) -> None:
+    def disc_full(self, kilobytes: int, late: bool = False) -> None:
+        """A disc of that size; late: that others fill up while the run is at work."""
         with _tmpfs(self.top / "disc", f"{kilobytes}k") as disc:
             (disc / "scene.toml").write_text(SCENE)
             job = Job(disc / "out", 2)
+            if late:
+                assert job.reaches("checkpoints"), job.lines[-5:]
+                with contextlib.suppress(OSError), (disc / "filler").open("wb") as filler:
+                    while True:
+                        filler.write(bytes(4096))
+                        filler.flush()
             status = job.end(60)
             assert status == 2, f"status {status}: {job.lines[-12:]}"
-            assert "cannot be written" in job.message, job.message
+            assert "cannot be written" in job.message or "are free there" in job.message, job.message
             if (disc / "out").exists():
                 self.honest(disc / "out")
             _mount("remount,size=200m", disc)
@@ -492,15 +505,19 @@ def _damaged_model(file: h5py.File) -> None:
 def inject(top: Path, n_kills: int = 100, seed: int = 0) -> Faults:
     """Every fault, and so many kills."""
     faults, few = Faults(top, seed), n_kills < 20
-    phases = [faults.rng.choice([*PHASES, "loop", "output", "checkpoints"]) for _ in range(n_kills)]
-    per_run = 5 if n_kills >= 10 else 3
-    order = list(PHASES)
-    chains = [sorted(phases[i : i + per_run], key=order.index) for i in range(0, n_kills, per_run)]
-    named = "any: " + ", ".join(dict.fromkeys(sorted(phases, key=order.index)))
-    faults.tried(
-        f"kill -9 of a rank ({n_kills} kills, each run killed {per_run} times)", named,
-        [lambda chain=chain, n=1 + (i % 3 > 0): faults.kills(chain, n) for i, chain in enumerate(chains)],
-    )  # fmt: skip
+    likely, order, per_run = [*PHASES, "loop", "output", "checkpoints"], list(PHASES), 3 if few else 5
+
+    def killing() -> Iterator[Callable[[], None]]:
+        runs = 0
+        while faults.killed < n_kills:
+            phases = sorted((faults.rng.choice(likely) for _ in range(per_run)), key=order.index)
+            ranks = 1 + (runs % 3 > 0)
+            yield partial(faults.kills, phases, ranks)
+            runs += 1
+
+    faults.tried("kill -9 of a rank, several times a run", "any", killing())
+    _, *ended = faults.rows.pop()
+    faults.rows.append((f"kill -9 of a rank, {faults.killed} times in all, up to {per_run} times a run", *ended))
     orders = [[2, 1]] if few else [[1, 2, 3, 4], [4, 3, 2, 1], [2, 4, 1, 3]]
     faults.tried("killed, continued on other ranks", "loop", [lambda o=o: faults.other_ranks(o) for o in orders])
     if few:
@@ -523,7 +540,8 @@ def inject(top: Path, n_kills: int = 100, seed: int = 0) -> Faults:
     faults.tried("another partition", "resume", [faults.another_partition])
     if can_mount():
         full = [lambda k=k: faults.disc_full(k) for k in (100, 300, 500, 700, 900, 1200)]
-        faults.tried("disc full", "build, write, checkpoint", full)
+        full += [lambda: faults.disc_full(5000, late=True)] * 4
+        faults.tried("disc full", "build, partition, start, checkpoint", full)
         faults.tried(
             "read-only folder", "start, resume", [lambda late=late: faults.read_only(late) for late in (False, True)]
         )

@@ -325,7 +325,7 @@ def test_an_unstable_run_stops_and_says_why(tmp_path, n):
 
 @pytest.mark.parametrize(("method", "keys"), [
     ("dynamic-relaxation", ("solver.load_steps=40",)),  # so fast that the seed runs into its neighbours
-    ("quasi-static", ("support.nodes=12", "solver.safety=1.0", "solver.load_time=0.1")),  # at the very edge of stability
+    ("quasi-static", ("support.nodes=12", "solver.safety=1.0", "solver.load_time=0.1")),  # at the edge of stability
 ])  # fmt: skip
 def test_an_unstable_run_recovers_on_request(tmp_path, method, keys):
     """It ends where a slow, safe run ends, within what both say is left to the static solution."""
