@@ -96,9 +96,10 @@ def _output(options: argparse.Namespace) -> Path:
 
 def _run(options: argparse.Namespace) -> None:
     from mpitled.deck import load_deck
+    from mpitled.errors import everywhere
     from mpitled.solver.halo import World
+    from mpitled.solver.job import run
     from mpitled.solver.progress import INTERRUPTS
-    from mpitled.solver.run import everywhere, run
 
     world = World()
     with everywhere():  # each rank reads the same file
@@ -128,8 +129,8 @@ def _run(options: argparse.Namespace) -> None:
 
 def _sweep(options: argparse.Namespace) -> int:
     from mpitled.batch import cases, growth, sweep, vary
+    from mpitled.errors import everywhere
     from mpitled.solver.halo import World
-    from mpitled.solver.run import everywhere
 
     world = World()
     with everywhere():  # each rank reads the same files
@@ -179,7 +180,7 @@ def _new(options: argparse.Namespace) -> None:
 
 def _build(options: argparse.Namespace) -> None:
     from mpitled.deck import load_deck
-    from mpitled.solver.run import build, ensure_partition
+    from mpitled.solver.job import build, ensure_partition
     from mpitled.store import describe_model
 
     deck = load_deck(options.deck, options.set)
@@ -209,13 +210,13 @@ def _export(options: argparse.Namespace) -> None:
 
 
 def _model(path: Path) -> Path:
-    from mpitled.solver.run import MODEL
+    from mpitled.solver.job import MODEL
 
     return path / MODEL if path.is_dir() else path
 
 
 def _partition(options: argparse.Namespace) -> None:
-    from mpitled.solver.run import divide
+    from mpitled.solver.job import divide
 
     path = _model(options.model)
     if options.parts < 2:

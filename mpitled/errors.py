@@ -42,3 +42,13 @@ def damaged(path: Path, remedy: str) -> Iterator[None]:
     except Exception as error:  # of h5py, json and numpy, each of which raises what it likes
         reason = " ".join(str(error).split())[:100] or "it does not fit together"
         raise InputError(f"{path}: is damaged ({type(error).__name__}: {reason}); {remedy}") from error
+
+
+@contextmanager
+def everywhere() -> Iterator[None]:
+    """What is raised inside is raised on every rank alike: the command need not abort the others."""
+    try:
+        yield
+    except MpitledError as error:
+        error.everywhere = True
+        raise

@@ -22,7 +22,7 @@ from mpitled.deck import Deck, load_deck
 from mpitled.errors import InputError
 from mpitled.model import Model
 from mpitled.results import views
-from mpitled.solver import run as runs
+from mpitled.solver import job
 from mpitled.solver.halo import World
 
 __all__ = ["Frames", "RunResult", "build_model", "load_deck", "open_result", "open_sweep", "run_deck"]
@@ -54,7 +54,7 @@ def run_deck(
         deck = load_deck(deck, overrides)
     elif overrides:
         raise InputError("overrides: are for a deck given as a path; give them to load_deck")
-    return runs.run(deck, Path(directory), World(), quiet=quiet, resume=resume)
+    return job.run(deck, Path(directory), World(), quiet=quiet, resume=resume)
 
 
 def open_result(path: str | Path) -> RunResult:

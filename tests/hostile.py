@@ -378,18 +378,18 @@ def _run(scratch: Path) -> tuple[Path, bytes, bytes, bytes]:
     """A small run's folder, its model (partitioned in two), its result, and a checkpoint."""
     from mpitled import store
     from mpitled.deck import load_deck
-    from mpitled.solver import run
+    from mpitled.solver import job
     from mpitled.solver.halo import World
 
     deck, folder = scratch / "run.toml", scratch / "run"
     deck.write_text(_SCENES["cloud"])
     if not (folder / "result.vtkhdf").exists():
-        run.run(load_deck(deck, ("output.pictures=false", "solver.load_time=0.05")), folder, World(), quiet=True)
-        run.ensure_partition(folder / run.MODEL, 2, 0)
-        rows = store.read_part(folder / run.MODEL, 1, 0)
+        job.run(load_deck(deck, ("output.pictures=false", "solver.load_time=0.05")), folder, World(), quiet=True)
+        job.ensure_partition(folder / job.MODEL, 2, 0)
+        rows = store.read_part(folder / job.MODEL, 1, 0)
         told = {"version": "0", "ranks": 1, "step": 3, "share": 0.1, "frames": 1}
         store.write_checkpoint(scratch, None, rows, told, {"u": np.zeros((rows.n_nodes, 3))}, [0.5, 1.0])
-    files = (folder / run.MODEL, folder / "result.vtkhdf", scratch / store.CHECKPOINTS[0])
+    files = (folder / job.MODEL, folder / "result.vtkhdf", scratch / store.CHECKPOINTS[0])
     model, result, kept = (path.read_bytes() for path in files)
     return folder, model, result, kept
 

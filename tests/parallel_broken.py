@@ -11,31 +11,31 @@ import numpy as np
 
 from mpitled import cli
 from mpitled.errors import UnstableError
-from mpitled.solver import run as runs
 from mpitled.solver.halo import World
+from mpitled.solver.run import Run
 
 BREAKS, AT = 2, 0.3  # the rank that does, and the share of the load at which
 
 
-def step_too_long(run: runs._Run, node: int) -> None:
+def step_too_long(run: Run, node: int) -> None:
     """As if the step were 100 times as long, on this rank."""
     run.method.state.mobility *= 1e4
 
 
-def not_a_number(run: runs._Run, node: int) -> None:
+def not_a_number(run: Run, node: int) -> None:
     """A displacement that is no number."""
     run.method.state.u[0, node] = np.nan
 
 
-def inverted_cell(run: runs._Run, node: int) -> None:
+def inverted_cell(run: Run, node: int) -> None:
     """A node on the other side of its cells."""
     run.method.state.u[0, node] += np.ptp(run.sub.rows.points[:, 0])
 
 
 def main(deck: str, directory: Path, way: str) -> None:
-    world, ends, watch = World(), {}, runs._Run._look
+    world, ends, watch = World(), {}, Run._look
 
-    def broken(run: runs._Run) -> None:
+    def broken(run: Run) -> None:
         try:
             watch(run)
         except UnstableError:
@@ -49,7 +49,7 @@ def main(deck: str, directory: Path, way: str) -> None:
             lonely[np.searchsorted(run.sub.rows.nodes, run.sub.rows.prescribed_dofs // 3)] = False
             globals()[way](run, int(np.flatnonzero(lonely)[0]))
 
-    runs._Run._look = broken  # type: ignore[method-assign]
+    Run._look = broken  # type: ignore[method-assign]
     try:
         cli.main(["run", "-q", deck, "--out", str(directory)])
     except SystemExit as end:

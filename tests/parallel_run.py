@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mpitled.deck import load_deck
-from mpitled.solver import run as runs
+from mpitled.solver import job
 from mpitled.solver.halo import World
 
 
@@ -16,13 +16,13 @@ def main(deck: Path, directory: Path) -> None:
     world = World()
     loops = []
 
-    class Watched(runs._Run):
+    class Watched(job.Run):
         def __init__(self, *arguments: object) -> None:
             super().__init__(*arguments)  # type: ignore[arg-type]
             loops.append(self)
 
-    runs._Run = Watched  # type: ignore[misc]
-    runs.run(load_deck(deck), directory, world, quiet=True)
+    job.Run = Watched  # type: ignore[misc]
+    job.run(load_deck(deck), directory, world, quiet=True)
     state, shared = loops[0].method.state, loops[0].sub.shared
     compared = 0
     for values in (state.u, state.u_prev, np.atleast_2d(state.mass)):

@@ -12,7 +12,7 @@ from conftest import mpitled
 from mpitled.deck import load_deck
 from mpitled.errors import InputError
 from mpitled.solver.halo import World
-from mpitled.solver.run import prepare, run
+from mpitled.solver.job import prepare, run
 from mpitled.speed.dry import left_out, reasons
 from mpitled.speed.witness import kernel_names
 from mpitled.store import open_result

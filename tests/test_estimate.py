@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mpitled.deck import load_deck
-from mpitled.solver import run
+from mpitled.solver import job
 from mpitled.solver.halo import World
 from mpitled.store import open_result
 
@@ -82,7 +82,7 @@ def compute(tmp_path):
     def compute(text, *overrides):
         path = tmp_path / "scene.toml"
         path.write_text(text + BRAIN)
-        made = run.run(load_deck(path, ("output.pictures=false", *overrides)), tmp_path / "out", World(), quiet=True)
+        made = job.run(load_deck(path, ("output.pictures=false", *overrides)), tmp_path / "out", World(), quiet=True)
         with open_result(tmp_path / "out") as result:
             return made, 1e3 * result.at_nodes("displacement", -1)
 

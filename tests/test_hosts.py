@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -115,9 +117,8 @@ def test_a_run_over_tcp_has_the_bits_of_one_on_a_single_host(hosts, tmp_path):
 def test_a_cut_cable_ends_the_job_on_both_hosts(hosts, tmp_path):
     deck, out = tmp_path / "scene.toml", tmp_path / "out"
     deck.write_text(SCENE)
-    job = start(
-        hosts, "run", deck, "--out", out, "--set", "solver.load_time=2000", "--set", "output.checkpoint_minutes=0.01"
-    )
+    keys = ("solver.load_time=2000", "output.checkpoint_minutes=0.01")
+    job = start(hosts, "run", deck, "--out", out, *itertools.chain(*(("--set", key) for key in keys)))
     begin = time.monotonic()
     try:
         while (
@@ -140,8 +141,32 @@ def test_a_cut_cable_ends_the_job_on_both_hosts(hosts, tmp_path):
     assert not at_work(hosts)
     assert frames(out) > 0
     assert not (out / "result.vtkhdf").exists()
-    # Whole, and of this run: a run with --resume goes on from it.
-    scene = load_deck(deck, ("solver.load_time=2000", "output.checkpoint_minutes=0.01"))
-    kept = checkpoint.find(out, scene, model_key(out / "model.h5") or "")
-    assert kept is not None
-    assert kept.told["step"] > 0
+    # The run goes on from what is left, on one host, and farther than it had come.
+    scene, key = load_deck(deck, keys), model_key(out / "model.h5") or ""
+
+    def step() -> int:
+        kept = checkpoint.find(out, scene, key)
+        assert kept is not None
+        return int(kept.told["step"])
+
+    cut_at = step()
+    assert cut_at > 0
+    words = [
+        *ranks(2),
+        Path(sys.executable).with_name("mpitled"),
+        "run",
+        deck,
+        "--out",
+        out,
+        "--resume",
+        *itertools.chain(*(("--set", key) for key in keys)),
+    ]
+    job = subprocess.Popen([str(word) for word in words], env=ENVIRONMENT, cwd=ROOT, text=True, stderr=subprocess.PIPE)
+    begin = time.monotonic()
+    while step() == cut_at and job.poll() is None and time.monotonic() - begin < 60:
+        time.sleep(0.1)
+    job.send_signal(signal.SIGUSR1)
+    _, said = job.communicate(timeout=SOON)
+    assert job.returncode == 4, said
+    assert "--resume goes on" in said
+    assert step() > cut_at

@@ -365,7 +365,7 @@ def test_an_exported_model_runs_to_the_same_bits(tmp_path):
     ]  # fmt: skip
     mpitled("run", tmp_path / "decks" / "scene.toml", "--out", tmp_path / "b")
     models = [store.read_model(tmp_path / x / "model.h5") for x in "ab"]
-    for name in store._MODEL_ARRAYS:
+    for name in store.MODEL_ARRAYS:
         one, other = (getattr(model, name) for model in models)
         assert one.tobytes() == other.tobytes(), name
     assert models[0].materials == models[1].materials
@@ -394,7 +394,7 @@ def test_an_exported_model_of_one_kind_of_cell_is_the_same(tmp_path, cloud):
     mpitled("export", tmp_path / "a" / "model.h5", "--abaqus")
     mpitled("build", tmp_path / "a" / "export" / "scene.toml", "--out", tmp_path / "b")
     models = [store.read_model(tmp_path / x / "model.h5") for x in "ab"]
-    for name in store._MODEL_ARRAYS:
+    for name in store.MODEL_ARRAYS:
         one, other = (getattr(model, name) for model in models)
         assert one.tobytes() == other.tobytes(), name
 

@@ -18,8 +18,9 @@ from mpitled import checksum, cli, store
 from mpitled import deck as decks
 from mpitled.deck import load_deck
 from mpitled.errors import InputError, InterruptedRun
-from mpitled.solver import run as runs
+from mpitled.solver import job
 from mpitled.solver.halo import World
+from mpitled.solver.run import Run
 
 BLOCK = """
 [block]
@@ -53,18 +54,18 @@ OF_THE_MACHINE = {"seconds", "term_seconds", "cell_updates_per_second", "halo_sh
 
 def run(deck: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, stop_at: int = 0, resume: bool = False) -> Any:
     """The report; or stop at a look, as a signal does, and give the number of looks that there were."""
-    looks, look = 0, runs._Run._look
+    looks, look = 0, Run._look
 
-    def counted(this: runs._Run) -> None:
+    def counted(this: Run) -> None:
         nonlocal looks
         looks += 1
         this.interrupts.asked = looks == stop_at
         look(this)
 
     with monkeypatch.context() as patch:
-        patch.setattr(runs._Run, "_look", counted)
+        patch.setattr(Run, "_look", counted)
         try:
-            report = runs.run(load_deck(deck), folder, World(), quiet=True, resume=resume)
+            report = job.run(load_deck(deck), folder, World(), quiet=True, resume=resume)
         except InterruptedRun:
             return looks
     report["looks"] = looks
@@ -123,7 +124,7 @@ def stopped(tmp_path, monkeypatch) -> tuple[Path, Path]:
 
 def test_another_run_is_refused(stopped, monkeypatch):
     deck, folder = stopped
-    go_on = lambda *keys: runs.run(load_deck(deck, keys), folder, World(), quiet=True, resume=True)  # noqa: E731
+    go_on = lambda *keys: job.run(load_deck(deck, keys), folder, World(), quiet=True, resume=True)  # noqa: E731
     with pytest.raises(
         InputError, match=r"checkpoint\.h5: was written for solver\.load_time = 0\.2, and not 0\.3; put"
     ):

@@ -21,6 +21,7 @@ from mpitled.errors import InputError
 from mpitled.material import Material
 from mpitled.mesh import grid_points, structured_hexahedra
 from mpitled.model import Model
+from mpitled.store import files
 
 
 def small_model(seed: int = 0) -> Model:
@@ -107,7 +108,7 @@ def test_what_is_not_a_model_is_refused_in_one_line(tmp_path: Path) -> None:
         store.read_model(path)
     store.write_model(path, small_model(), "k")
     with h5py.File(path, "r+") as file:
-        file.attrs["layout"] = store.MODEL_LAYOUT + 1
+        file.attrs["layout"] += 1
     with pytest.raises(InputError, match="layout") as refusal:
         store.read_part(path, 1, 0)
     assert "\n" not in str(refusal.value)
@@ -122,7 +123,7 @@ def test_a_failed_write_leaves_the_old_model(tmp_path: Path, monkeypatch: pytest
     def fail(*_: object) -> None:
         raise OSError("disc full")
 
-    monkeypatch.setattr(store, "_fsync", fail)
+    monkeypatch.setattr(files, "fsync", fail)
     with pytest.raises(InputError, match=r"cannot be written \(disc full"):
         store.write_model(path, model, "new")
     with pytest.raises(InputError, match=r"cannot be written \(disc full"):
@@ -193,8 +194,8 @@ def test_parts_are_the_rows_of_the_model(tmp_path: Path, n_parts: int) -> None:
 
 @pytest.mark.parametrize("gap_bytes", [0, 1 << 16])
 def test_rows_are_read_by_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gap_bytes: int) -> None:
-    monkeypatch.setattr(store, "_GAP_BYTES", gap_bytes)
-    monkeypatch.setattr(store, "_BLOCK_BYTES", 1 << 10)
+    monkeypatch.setattr(files, "_GAP_BYTES", gap_bytes)
+    monkeypatch.setattr(files, "_BLOCK_BYTES", 1 << 10)
     data = np.random.default_rng(0).random((5000, 4))
     with h5py.File(tmp_path / "rows.h5", "w") as file:
         file["data"] = data

@@ -37,7 +37,7 @@ from mpitled.deck import Deck, load_deck
 from mpitled.loading import sphere_radius
 from mpitled.mesh import CORNERS, Mesh
 from mpitled.results import compare, field
-from mpitled.solver import run as runs
+from mpitled.solver import job
 from mpitled.solver.halo import World
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -209,7 +209,7 @@ def _figures(cells: int, unknowns: int, setup: float, solution: float, steps: in
 
 def _explicit(deck: Deck, places: NDArray[np.float64]) -> tuple[NDArray[np.float64], dict[str, Any]]:
     """mpitled's displacements (n, 3), m, at places (n, 3), and its figures."""
-    report = runs.run(deck, OUT / "run", World(), quiet=True)
+    report = job.run(deck, OUT / "run", World(), quiet=True)
     ours, seconds = field.open_field(OUT / "run"), report["seconds"]
     setup = seconds["model"] + seconds["partition"] + seconds["read"]
     unknowns = 3 * ours.model.n_nodes - len(ours.model.prescribed_dofs)

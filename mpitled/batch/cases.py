@@ -15,7 +15,7 @@ from mpitled.batch import launch, vary
 from mpitled.deck import Deck
 from mpitled.errors import InputError
 from mpitled.loading import sphere_radius
-from mpitled.solver.run import included
+from mpitled.solver.job import included
 
 MANIFEST = "sweep.json"
 #: Frames of a run that passes through the volumes of a sweep; between them results are interpolated.

@@ -19,8 +19,8 @@ from mpitled import store
 from mpitled.batch import launch
 from mpitled.batch.cases import Case, Sweep, is_sweep
 from mpitled.batch.screen import Screen, share_done
-from mpitled.errors import InputError, InterruptedRun, MpitledError
-from mpitled.solver import run as runs
+from mpitled.errors import InputError, InterruptedRun, MpitledError, everywhere
+from mpitled.solver import job
 from mpitled.solver.halo import World
 
 _WATCH = 0.2  # s between looks at what is at work
@@ -33,7 +33,7 @@ def compute(sweep: Sweep, world: World, *, jobs: int = 1, retry: bool = False, o
     `sweep.ranks` take the cases. `only` is the number of the one case to compute, as array jobs do.
     InputError alike on all ranks if the numbers do not fit each other; InterruptedRun if it is ended from outside.
     """
-    with runs.everywhere():
+    with everywhere():
         if world.size > 1 and world.size % sweep.ranks:
             raise InputError(f"--ranks {sweep.ranks}: {world.size} ranks are no whole groups of it; start a multiple")
         if only is not None and not 0 < only <= len(sweep.cases):
@@ -41,7 +41,7 @@ def compute(sweep: Sweep, world: World, *, jobs: int = 1, retry: bool = False, o
     cases = [case for case in sweep.runs if only is None or case.number == only]
     with _alone(sweep, world, only):
         token = world.broadcast(secrets.token_hex(4))
-        todo = runs.on_leader(world, lambda: [case.number for case in _to_do(cases, retry)])
+        todo = world.on_leader(lambda: [case.number for case in _to_do(cases, retry)])
         todo = [case for case in cases if case.number in todo]
         todo.sort(key=lambda case: -case.work)
         first = {case.model: case for case in todo if case.shares and not _is_built(case, sweep.ranks)}
@@ -61,7 +61,7 @@ def _to_do(cases: Sequence[Case], retry: bool) -> list[Case]:
 
 
 def _is_built(case: Case, ranks: int) -> bool:
-    path = case.model / runs.MODEL
+    path = case.model / job.MODEL
     return path.exists() and store.has_partition(path, ranks)
 
 
@@ -84,7 +84,7 @@ def _alone(sweep: Sweep, world: World, only: int | None) -> Iterator[None]:
         for stale in sweep.folder.glob(".claims-*"):
             shutil.rmtree(stale, ignore_errors=True)
 
-    runs.on_leader(world, lock)
+    world.on_leader(lock)
     try:
         yield
     finally:
@@ -126,7 +126,7 @@ def _as_processes(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], jo
 
 def _start(sweep: Sweep, case: Case, verb: str) -> launch.Process:
     folder = case.folder if verb == "run" else case.model
-    launch.prepare(folder, case.model / runs.MODEL if verb == "run" and case.shares else None)
+    launch.prepare(folder, case.model / job.MODEL if verb == "run" and case.shares else None)
     return launch.Process(launch.command(verb, sweep.deck, case.overrides, sweep.ranks, folder), folder)
 
 
@@ -142,7 +142,7 @@ def _end(sweep: Sweep, case: Case, failure: str, screen: Screen) -> None:
 def _in_groups(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], world: World, claims: Path) -> None:
     """Each group takes the first case in the queue that no other has taken, until there is none."""
     group = world.split(sweep.ranks)
-    runs.on_leader(world, lambda: claims.mkdir())
+    world.on_leader(lambda: claims.mkdir())
     for case in models:
         if group.leads and _claim(claims / case.model.name):
             _build(sweep, case)
@@ -152,7 +152,7 @@ def _in_groups(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], world
         if group.broadcast(group.leads and _claim(claims / case.folder.name)):
             _run(sweep, case, group, screen, world)
     world.barrier()
-    runs.on_leader(world, lambda: shutil.rmtree(claims, ignore_errors=True))
+    world.on_leader(lambda: shutil.rmtree(claims, ignore_errors=True))
 
 
 def _claim(path: Path) -> bool:
@@ -167,8 +167,8 @@ def _claim(path: Path) -> bool:
 def _build(sweep: Sweep, case: Case) -> None:
     """The model that several cases share; what it lacks is said by the cases that cannot build it either."""
     try:
-        path, _ = runs.build(case.deck, case.model)
-        runs.ensure_partition(path, sweep.ranks, case.deck.partition.seed)
+        path, _ = job.build(case.deck, case.model)
+        job.ensure_partition(path, sweep.ranks, case.deck.partition.seed)
     except Exception:
         pass
 
@@ -176,11 +176,11 @@ def _build(sweep: Sweep, case: Case) -> None:
 def _run(sweep: Sweep, case: Case, group: World, screen: Screen, world: World) -> None:
     """Compute a case on a group's ranks; its error ends the case alone if all of the group know of it."""
     if group.leads:
-        launch.prepare(case.folder, case.model / runs.MODEL if case.shares else None)
+        launch.prepare(case.folder, case.model / job.MODEL if case.shares else None)
     failure = ""
     with _logged(case.folder / launch.LOG if group.leads else Path(os.devnull)):
         try:
-            runs.run(case.deck, case.folder, group)
+            job.run(case.deck, case.folder, group)
         except InterruptedRun as error:
             _abandon(world, error)
         except Exception as error:

@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from mpitled.errors import MpitledError, everywhere
 from mpitled.solver import kernels
 
 #: What launchers tell each process of the number of ranks (OpenMPI, MPICH and Intel MPI, PMIx under SLURM).
@@ -60,6 +61,20 @@ class World:
     def broadcast(self, value: Any, root: int = 0) -> Any:
         """A small object of one rank, on all."""
         return value if self.comm is None else self.comm.bcast(value, root)
+
+    def on_leader(self, work: Callable[[], Any]) -> Any:
+        """The result of work, done by rank 0, on all ranks; its error likewise, before anything collective follows."""
+        outcome: Any = None
+        if self.leads:
+            try:
+                outcome = work()
+            except MpitledError as error:
+                outcome = error
+        with everywhere():
+            outcome = self.broadcast(outcome)
+            if isinstance(outcome, MpitledError):
+                raise outcome
+        return outcome
 
     def barrier(self) -> None:
         if self.comm is not None:

@@ -25,8 +25,9 @@ KEEP = 0.9
 #: The estimate has to hold for so many steps, and the lowest eigenvalue to change by less than this share in BETWEEN of
 #: them: it falls while the quick modes that hide the slow ones die.
 SETTLED, STEADY = 50, 0.1
-#: At most so much would a cell next to moved nodes be strained in a step, if nothing gave way (`load_steps` = "auto").
-STRAIN_PER_STEP = 0.1
+#: `load_steps` = "auto": at most so much would a cell next to moved nodes be strained in a step, if nothing gave way;
+#: and the load takes no less than a shear wave across so many cells, for what keeps its volume has to flow.
+STRAIN_PER_STEP, SHEAR_CELLS = 0.1, 14
 #: It has stalled when so many surveys in a row have not brought the least estimate down by this factor: round-off.
 STALLED, BETTER = 300, 0.99
 
@@ -78,13 +79,15 @@ class Relaxation:
     def _load_steps(self, given: Literal["auto"] | int, world: World) -> float:
         """Steps in which the load grows. Collective.
 
-        A step carries motion about one cell farther, whatever the cell: what counts is the speed of moved nodes, at its
-        largest 15/8 of the mean on the loading curve, in cells a step. The load takes no less than five surveys.
+        A step carries a pressure wave about one cell farther, whatever the cell, and a shear wave as much less as it is
+        slower: what counts is the speed of moved nodes, at its largest 15/8 of the mean on the loading curve, in cells
+        a step. The load takes no less than five surveys.
         """
         if given != "auto":
             return float(given)
+        slowness = math.sqrt(max((m.lam + 2 * m.mu) / m.mu for m in self.sub.rows.materials))
         steepest = float(world.gather([self.sub.steepest_load()]).max())
-        return max(5.0 * BETWEEN, math.ceil(15 / 8 * steepest / STRAIN_PER_STEP))
+        return max(5.0 * BETWEEN, math.ceil(SHEAR_CELLS * slowness), math.ceil(15 / 8 * steepest / STRAIN_PER_STEP))
 
     def start_from(self, s: State, energy: float) -> None:
         """Go on from the displacements of another run at the end of its load, at rest; `energy` (J) is in its cells."""
@@ -184,11 +187,14 @@ class Relaxation:
         s = self.state
         known = figures["rayleigh_force"] / figures["rayleigh_mass"] if figures["rayleigh_mass"] > 0 else 0.0
         loaded, steady = s.share >= 1, False
-        if loaded and known > 0:
-            steady = abs(known - self.lowest) < STEADY * self.between / BETWEEN * self.lowest
-            self.lowest = known
-            frequency = math.sqrt(known)
-            self.distance = max(figures["change"] / frequency, figures["residual"] / known)
+        if loaded:
+            if known > 0:
+                steady = abs(known - self.lowest) < STEADY * self.between / BETWEEN * self.lowest
+                self.lowest = known
+            if self.lowest > 0:
+                self.distance = max(figures["change"] / math.sqrt(self.lowest), figures["residual"] / self.lowest)
+            elif figures["change"] == figures["residual"] == 0:
+                self.distance = 0.0  # nothing has ever moved since
             steady = steady or self.distance < 1e-6 * self.tolerance  # round-off, whose quotient is no eigenvalue
             self.settled = self.settled + self.between if steady and self.distance < self.tolerance else 0
         damping = 2 * math.sqrt(self.lowest)

@@ -1,4 +1,4 @@
-"""From a deck to a result: model and partition by one rank, then the time loop on all, watched every few steps."""
+"""The time loop of one rank, watched every few steps, and what is written, kept and counted around it."""
 
 from __future__ import annotations
 
@@ -6,22 +6,18 @@ import importlib.metadata
 import logging
 import math
 import resource
-import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-import partition
 from mpitled import deck as decks
 from mpitled import room, store
 from mpitled.deck import Deck
-from mpitled.errors import InputError, InterruptedRun, MpitledError, UnstableError
+from mpitled.errors import InterruptedRun, MpitledError, UnstableError, everywhere
 from mpitled.loading import sphere_radius
 from mpitled.solver import checkpoint
 from mpitled.solver.halo import Halo, World
@@ -30,17 +26,13 @@ from mpitled.solver.memory import Kept, Memory, Parts, recall, remember
 from mpitled.solver.progress import Interrupts, Phases, Progress
 from mpitled.solver.relaxation import Relaxation
 from mpitled.solver.step import State, Term
-from mpitled.solver.subdomain import Subdomain, cell_costs, localise
-from mpitled.solver.watch import Watch
+from mpitled.solver.subdomain import Subdomain
+from mpitled.solver.watch import BALANCE_LIMIT, Watch
 
 #: Looks from one state that recovery can go back to until the next, and how often a run may go back.
 SAVED, RECOVERIES = 5, 5
-#: What `solver.precision` means for the cells' arithmetic.
-PRECISIONS: dict[str, type[np.floating]] = {"double": np.float64, "single": np.float32}
-
-MODEL = "model.h5"
-#: Said of a run that is at its end.
-DONE = "done"
+#: A state whose energies are farther out of balance, as a share of what ends a run, is ill already.
+HEALTHY = 0.2
 #: What a run is asked at a look: nothing, to keep a checkpoint, to keep one and end.
 KEEP, END = 1, 2
 
@@ -48,157 +40,11 @@ KEEP, END = 1, 2
 _log = logging.getLogger(__name__)
 
 
-def build(deck: Deck, directory: Path) -> tuple[Path, bool]:
-    """The model of a deck in directory/model.h5, and whether it had to be built: the same deck uses it again."""
-    path = directory / MODEL
-    key = decks.model_key(deck, included(deck))
-    if store.model_key(path) == key:
-        try:
-            store.check_model(path)
-            return path, False
-        except InputError as error:
-            print(f"note: {error}; it is built anew", file=sys.stderr, flush=True)
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{directory}: cannot be made ({error.strerror}); give another folder with --out") from None
-    from mpitled import preprocess  # only the rank that builds needs the meshers
-
-    store.write_model(path, preprocess.build(deck), key, decks.canonical(deck))
-    return path, True
-
-
-def included(deck: Deck) -> list[Path]:
-    """Files that those of the deck read in turn."""
-    if not deck.mesh:
-        return []
-    from mpitled.readers import meshes
-
-    return meshes.files(deck.mesh)
-
-
-def divide(path: Path, n_parts: int, seed: int) -> str:
-    """Partition a model in n_parts, stored in its file under that number; a table of the parts."""
-    hexahedra, domains, places = store.read_cells(path)
-    costs = cell_costs(store.read_points(path), hexahedra, domains)
-    graph = partition.cell_graph(hexahedra, domains, places)
-    try:
-        part = partition.cut(graph, n_parts, costs, seed)
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from None
-    tables = partition.tables(hexahedra, domains, part, n_parts)
-    store.write_partition(path, tables)
-    return partition.figures(tables, costs, len(hexahedra), graph).describe()
-
-
-def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False, resume: bool = False) -> dict[str, Any]:
-    """Compute a deck on all ranks; writes model.h5, result.vtkhdf, report.json and pictures into the directory.
-
-    With `resume` it goes on from the last checkpoint there, on any number of ranks, or makes what is missing of a
-    result that is there; from the start where there is neither.
-
-    The report, on every rank. InputError, UnstableError or InterruptedRun alike on all ranks.
-    """
-    with Interrupts(world) as interrupts:
-        found = on_leader(world, lambda: _resumable(deck, directory)) if resume else None
-        if found == DONE:
-            return _report(directory, world)
-        return prepare(deck, directory, world, quiet=quiet, found=found).run(interrupts)
-
-
-def _resumable(deck: Deck, directory: Path) -> checkpoint.Found | str | None:
-    """Where a run goes on, DONE if nothing but the report may be missing, None if it is to begin; says so."""
-    key = decks.model_key(deck, included(deck))
-    if checkpoint.is_done(directory, deck, key):
-        return DONE
-    found = checkpoint.find(directory, deck, key)
-    if found is None:
-        print(f"note: {directory}: holds no checkpoint; the run begins at the start", file=sys.stderr, flush=True)
-    elif found.damaged:
-        print(f"note: {found.damaged}; the run goes on from {found.path.name}", file=sys.stderr, flush=True)
-    return found
-
-
-def _report(directory: Path, world: World, seconds: Mapping[str, float] | None = None) -> dict[str, Any]:
-    """Of a run that is at its end, whose checkpoints nobody needs any more."""
-    from mpitled.results import report
-
-    def write() -> dict[str, Any]:
-        store.discard_checkpoints(directory)
-        return report.write(directory, seconds)
-
-    return dict(on_leader(world, write))
-
-
-def prepare(
-    deck: Deck, directory: Path, world: World, *, quiet: bool = False, found: checkpoint.Found | None = None
-) -> _Run:
-    """All that is done before the first step of `run`: model, partition, this rank's part, and the composed step."""
-    phases = Phases()
-    with phases("model"):
-        path = on_leader(world, lambda: build(deck, directory)[0])
-    if world.leads and not quiet:
-        for remark in store.read_remarks(path):
-            print(f"note: {remark}", file=sys.stderr, flush=True)
-    with phases("partition"):
-        if world.size > 1:
-            on_leader(world, lambda: ensure_partition(path, world.size, deck.partition.seed))
-        mark = on_leader(world, lambda: store.partition_mark(path, world.size))
-    with everywhere():
-        if found and found.told["ranks"] == world.size and found.told["partition"] != mark:
-            raise InputError(
-                f"{found.path}: was written for another partition in {world.size} parts; partition the model with the "
-                "seed that it had, go on with another number of ranks, or begin anew without --resume"
-            )
-    with phases("read"):
-        rows = store.read_part(path, world.size, world.rank)
-        rule = deck.hexahedra.gradient
-        sub = localise(
-            rows, deck.hexahedra.hourglass, deck.support.stabilisation, rule, PRECISIONS[deck.solver.precision]
-        )
-        figures = store.read_figures(path)
-    with everywhere():  # each rank finds the same
-        about = checkpoint.marks(deck, store.model_key(path) or "") | {"ranks": world.size, "partition": mark}
-        return _Run(deck, directory, world, sub, figures, phases, quiet, about, found)
-
-
-@contextmanager
-def everywhere() -> Iterator[None]:
-    """What is raised inside is raised on every rank alike: the command need not abort the others."""
-    try:
-        yield
-    except MpitledError as error:
-        error.everywhere = True
-        raise
-
-
-def ensure_partition(path: Path, n_parts: int, seed: int) -> None:
-    """Partition a model unless it is partitioned in as many parts."""
-    if not store.has_partition(path, n_parts):
-        divide(path, n_parts, seed)
-
-
-def on_leader(world: World, work: Callable[[], Any]) -> Any:
-    """The result of work, done by rank 0, on all ranks; its error likewise, before anything collective follows."""
-    outcome: Any = None
-    if world.leads:
-        try:
-            outcome = work()
-        except MpitledError as error:
-            outcome = error
-    with everywhere():
-        outcome = world.broadcast(outcome)
-        if isinstance(outcome, MpitledError):
-            raise outcome
-    return outcome
-
-
-class _Run:
+class Run:
     """The time loop of one rank and what is watched, written and counted around it."""
 
-    LASTING = Kept(
-        nodes=("loaded",), alike=("made", "recoveries", "looks", "frames", "written", "good_time", "good_figures")
-    )
+    PASSING = Kept(alike=("frames", "written"))
+    LASTING = Kept(nodes=("loaded",), alike=("made", "recoveries", "looks", "good_time", "good_figures"))
 
     def __init__(
         self,
@@ -256,9 +102,10 @@ class _Run:
         needed = self.output_bytes - store.unfinished_bytes(self.directory)
         room.check_disc(needed, self.directory, what, "lower output.frames, or give another folder")
 
-    def run(self, interrupts: Interrupts) -> dict[str, Any]:
+    def run(self, interrupts: Interrupts) -> dict[str, float]:
+        """To the end, with a result that is whole; the seconds of each phase on this rank. Collective."""
         self.interrupts = interrupts
-        on_leader(self.world, self._check_disc)
+        self.world.on_leader(self._check_disc)
         with self.phases("compile"):
             self.warm_up()
         with self.phases("begin"), everywhere():
@@ -266,7 +113,7 @@ class _Run:
                 self._resume(self.found)
             else:
                 self.method.begin()
-                if on_leader(self.world, lambda: store.discard_checkpoints(self.directory)) and self.progress:
+                if self.world.on_leader(lambda: store.discard_checkpoints(self.directory)) and self.progress:
                     self.progress.tell("the checkpoint of an earlier run is discarded; --resume would go on from it")
         writer = store.ResultWriter(
             self.directory,
@@ -311,8 +158,7 @@ class _Run:
         seconds = self.made["seconds"] | self.phases.seconds
         with self.phases("close"):
             writer.close(self.made | {"seconds": seconds})
-        with self.phases("report"):
-            return _report(self.directory, self.world, seconds)
+        return seconds
 
     def _advance(self, writer: store.ResultWriter) -> None:
         """Steps, a survey and decisions, and so on to the end of the method."""
@@ -354,7 +200,10 @@ class _Run:
                     self._write_last_good(writer)
                     raise
                 self.recoveries += 1
+                while len(self.saved) > 1:
+                    self.saved.pop()
                 recall(self._passing, self.saved[0])
+                writer.rewind(self.frames)
                 method.state.show()
                 method.harden()
                 self._take(method.forces)
@@ -364,9 +213,8 @@ class _Run:
                 self._write(writer, method.frame_time)
         if last:
             return False
-        if self.method.recovers and (due or self.looks % SAVED == 0):
-            if due:
-                self.saved.clear()  # what is written stays
+        healthy = self.watch.figures["balance_error"] < HEALTHY * BALANCE_LIMIT
+        if self.method.recovers and self.looks % SAVED == 0 and healthy:
             self.saved.append(remember(self._passing))
         self.looks += 1
         if self.watch.request:
@@ -401,7 +249,11 @@ class _Run:
     @property
     def _passing(self) -> Parts:
         """What an unstable run goes back to."""
-        return ("method", self.method, self.method.PASSING), ("state", self.method.state, State.KEPT)
+        return (
+            ("method", self.method, self.method.PASSING),
+            ("state", self.method.state, State.KEPT),
+            ("output", self, self.PASSING),
+        )
 
     @property
     def _lasting(self) -> Parts:

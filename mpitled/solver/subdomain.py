@@ -23,6 +23,8 @@ GATHERED_COST = 3.0
 DOMAIN_NODE_COST = 0.32
 #: Edges of a box agree this well relative to their length: the round-off of coordinates far from the origin.
 BOX_TOLERANCE = 1e-11
+#: What `solver.precision` means for the cells' arithmetic.
+PRECISIONS: dict[str, type[np.floating]] = {"double": np.float64, "single": np.float32}
 
 # Corners on the four lines along each axis, (3, 4, 2): near and far. Lines and axes are in turn from that axis.
 _NUMBER = {tuple(corner): number for number, corner in enumerate(CORNERS.tolist())}

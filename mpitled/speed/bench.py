@@ -21,7 +21,7 @@ from mpitled import preprocess, store
 from mpitled.batch import launch
 from mpitled.deck import Deck, Support, load_deck
 from mpitled.errors import InputError
-from mpitled.solver import run as runs
+from mpitled.solver import job
 from mpitled.solver.halo import World
 from mpitled.speed import flops
 
@@ -107,9 +107,9 @@ def bench(ranks: Sequence[int], quick: bool, old: dict[str, Any] | None = None) 
                 scenes.append(scene(folder / f"{kind}-{size}", kind, size))
                 for n in ranks:
                     if n > 1:
-                        runs.divide(Path(scenes[-1]["model"]), n, 0)
-        job = {"scenes": scenes, "operations": _operations(folder), "quick": quick}
-        outcomes = [_timed(folder, job, n) for n in ranks]
+                        job.divide(Path(scenes[-1]["model"]), n, 0)
+        task = {"scenes": scenes, "operations": _operations(folder), "quick": quick}
+        outcomes = [_timed(folder, task, n) for n in ranks]
         result = {
             "machine": _machine(),
             "commit": _commit(),
@@ -119,8 +119,8 @@ def bench(ranks: Sequence[int], quick: bool, old: dict[str, Any] | None = None) 
         for n in ranks:
             slower = {case["scene"] for case, ratio in compared(result, old) if ratio < SLOWER and case["ranks"] == n}
             if slower:
-                job["scenes"] = [each for each in scenes if each["scene"] in slower]
-                _keep_better(result["cases"], _timed(folder, job, n)["cases"])
+                task["scenes"] = [each for each in scenes if each["scene"] in slower]
+                _keep_better(result["cases"], _timed(folder, task, n)["cases"])
         return result
 
 
@@ -128,9 +128,9 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def _timed(folder: Path, job: dict[str, Any], ranks: int) -> dict[str, Any]:
-    path = folder / "job.json"
-    path.write_text(json.dumps(job))
+def _timed(folder: Path, task: dict[str, Any], ranks: int) -> dict[str, Any]:
+    path = folder / "task.json"
+    path.write_text(json.dumps(task))
     words = [*launch.ranked(ranks), sys.executable, "-c", "from mpitled.speed.pace import main; main()", str(path)]
     done = subprocess.run(words, stdout=subprocess.PIPE, text=True)
     if done.returncode:
@@ -240,7 +240,7 @@ def scene(folder: Path, kind: str, size: Any, nodes: int = DOMAIN_NODES) -> dict
     """Build one scene in a folder of its own, and say what a process needs to know of it."""
     folder.mkdir()
     deck = _deck(folder, kind, size, nodes)
-    model = folder / runs.MODEL
+    model = folder / job.MODEL
     mesh = preprocess.read_mesh(deck)
     if kind == "distorted":
         assert deck.block is not None

@@ -14,7 +14,8 @@ import numpy as np
 from mpitled import deck as decks
 from mpitled import room
 from mpitled.deck import Deck
-from mpitled.solver import run as runs
+from mpitled.errors import everywhere
+from mpitled.solver import job
 from mpitled.solver.halo import World
 from mpitled.solver.march import March
 from mpitled.solver.subdomain import SHORTEST_RUN, Subdomain
@@ -27,9 +28,9 @@ def dry_run(deck: Deck, directory: Path, world: World) -> str:
 
     Every kernel is called a few times on the undeformed body, to see which it is, what it takes and how long.
     """
-    run = runs.prepare(deck, directory, world)
+    run = job.prepare(deck, directory, world)
     run.warm_up()
-    with runs.everywhere():
+    with everywhere():
         run.method.begin()
     method, sub = run.method, run.sub
     terms = [(name, partial(act, method.state)) for name, act in (*method.forces, *method.motion)]
@@ -81,7 +82,7 @@ def _kernels(calls: Sequence[Call]) -> list[str]:
 def left_out(directory: Path, metadata: Mapping[str, Any]) -> list[str]:
     """What the run in a directory, whose result records this of it, did without on rank 0, as `dry_run` tells it."""
     deck, ranks = decks.recorded(metadata["deck"], directory), metadata["ranks"]
-    sub, method = forecast.first_rank(deck, directory / runs.MODEL, ranks)
+    sub, method = forecast.first_rank(deck, directory / job.MODEL, ranks)
     return _left_out(deck, sub, ranks, witness([("all", method.warm_up)]))
 
 

@@ -16,8 +16,7 @@ from mpitled.model import Model
 from mpitled.solver.halo import World
 from mpitled.solver.march import March
 from mpitled.solver.relaxation import Relaxation
-from mpitled.solver.run import PRECISIONS
-from mpitled.solver.subdomain import Subdomain, localise
+from mpitled.solver.subdomain import PRECISIONS, Subdomain, localise
 
 #: Times that each term is called to tell how long it takes; the fastest counts, for others may use the machine too.
 CALLS = 9

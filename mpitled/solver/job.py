@@ -1,0 +1,146 @@
+"""From a deck to a result: model and partition by one rank, then the run on all."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import partition
+from mpitled import deck as decks
+from mpitled import store
+from mpitled.deck import Deck
+from mpitled.errors import InputError, everywhere
+from mpitled.solver import checkpoint
+from mpitled.solver.halo import World
+from mpitled.solver.progress import Interrupts, Phases
+from mpitled.solver.run import Run
+from mpitled.solver.subdomain import PRECISIONS, cell_costs, localise
+
+MODEL = "model.h5"
+#: Said of a run that is at its end.
+DONE = "done"
+
+
+def build(deck: Deck, directory: Path) -> tuple[Path, bool]:
+    """The model of a deck in directory/model.h5, and whether it had to be built: the same deck uses it again."""
+    path = directory / MODEL
+    key = decks.model_key(deck, included(deck))
+    if store.model_key(path) == key:
+        try:
+            store.check_model(path)
+            return path, False
+        except InputError as error:
+            print(f"note: {error}; it is built anew", file=sys.stderr, flush=True)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{directory}: cannot be made ({error.strerror}); give another folder with --out") from None
+    from mpitled import preprocess  # only the rank that builds needs the meshers
+
+    store.write_model(path, preprocess.build(deck), key, decks.canonical(deck))
+    return path, True
+
+
+def included(deck: Deck) -> list[Path]:
+    """Files that those of the deck read in turn."""
+    if not deck.mesh:
+        return []
+    from mpitled.readers import meshes
+
+    return meshes.files(deck.mesh)
+
+
+def divide(path: Path, n_parts: int, seed: int) -> str:
+    """Partition a model in n_parts, stored in its file under that number; a table of the parts."""
+    hexahedra, domains, places = store.read_cells(path)
+    costs = cell_costs(store.read_points(path), hexahedra, domains)
+    graph = partition.cell_graph(hexahedra, domains, places)
+    try:
+        part = partition.cut(graph, n_parts, costs, seed)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+    tables = partition.tables(hexahedra, domains, part, n_parts)
+    store.write_partition(path, tables)
+    return partition.figures(tables, costs, len(hexahedra), graph).describe()
+
+
+def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False, resume: bool = False) -> dict[str, Any]:
+    """Compute a deck on all ranks; writes model.h5, result.vtkhdf, report.json and pictures into the directory.
+
+    With `resume` it goes on from the last checkpoint there, on any number of ranks, or makes what is missing of a
+    result that is there; from the start where there is neither.
+
+    The report, on every rank. InputError, UnstableError or InterruptedRun alike on all ranks.
+    """
+    with Interrupts(world) as interrupts:
+        found = world.on_leader(lambda: _resumable(deck, directory)) if resume else None
+        if found == DONE:
+            return _report(directory, world)
+        run = prepare(deck, directory, world, quiet=quiet, found=found)
+        seconds = run.run(interrupts)
+        with run.phases("report"):
+            return _report(directory, world, seconds)
+
+
+def _report(directory: Path, world: World, seconds: Mapping[str, float] | None = None) -> dict[str, Any]:
+    """Of a run that is at its end, whose checkpoints nobody needs any more."""
+    from mpitled.results import report
+
+    def write() -> dict[str, Any]:
+        store.discard_checkpoints(directory)
+        return report.write(directory, seconds)
+
+    return dict(world.on_leader(write))
+
+
+def _resumable(deck: Deck, directory: Path) -> checkpoint.Found | str | None:
+    """Where a run goes on, DONE if nothing but the report may be missing, None if it is to begin; says so."""
+    key = decks.model_key(deck, included(deck))
+    if checkpoint.is_done(directory, deck, key):
+        return DONE
+    found = checkpoint.find(directory, deck, key)
+    if found is None:
+        print(f"note: {directory}: holds no checkpoint; the run begins at the start", file=sys.stderr, flush=True)
+    elif found.damaged:
+        print(f"note: {found.damaged}; the run goes on from {found.path.name}", file=sys.stderr, flush=True)
+    return found
+
+
+def prepare(
+    deck: Deck, directory: Path, world: World, *, quiet: bool = False, found: checkpoint.Found | None = None
+) -> Run:
+    """All that is done before the first step of `run`: model, partition, this rank's part, and the composed step."""
+    phases = Phases()
+    with phases("model"):
+        path = world.on_leader(lambda: build(deck, directory)[0])
+    if world.leads and not quiet:
+        for remark in store.read_remarks(path):
+            print(f"note: {remark}", file=sys.stderr, flush=True)
+    with phases("partition"):
+        if world.size > 1:
+            world.on_leader(lambda: ensure_partition(path, world.size, deck.partition.seed))
+        mark = world.on_leader(lambda: store.partition_mark(path, world.size))
+    with everywhere():
+        if found and found.told["ranks"] == world.size and found.told["partition"] != mark:
+            raise InputError(
+                f"{found.path}: was written for another partition in {world.size} parts; partition the model with the "
+                "seed that it had, go on with another number of ranks, or begin anew without --resume"
+            )
+    with phases("read"):
+        rows = store.read_part(path, world.size, world.rank)
+        rule = deck.hexahedra.gradient
+        sub = localise(
+            rows, deck.hexahedra.hourglass, deck.support.stabilisation, rule, PRECISIONS[deck.solver.precision]
+        )
+        figures = store.read_figures(path)
+    with everywhere():  # each rank finds the same
+        about = checkpoint.marks(deck, store.model_key(path) or "") | {"ranks": world.size, "partition": mark}
+        return Run(deck, directory, world, sub, figures, phases, quiet, about, found)
+
+
+def ensure_partition(path: Path, n_parts: int, seed: int) -> None:
+    """Partition a model unless it is partitioned in as many parts."""
+    if not store.has_partition(path, n_parts):
+        divide(path, n_parts, seed)
