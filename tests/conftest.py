@@ -30,9 +30,13 @@ def ranks(n: int) -> list[str]:
     return ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(n)]
 
 
-def mpitled(*arguments: object, n: int = 1, status: int = 0, timeout: float = 120) -> subprocess.CompletedProcess[str]:
-    """Run the command on n ranks and see that it ends with this status."""
+def mpitled(
+    *arguments: object, n: int = 1, status: int = 0, timeout: float = 120, pictures: bool = False
+) -> subprocess.CompletedProcess[str]:
+    """Run the command on n ranks and see that it ends with this status; runs leave out their pictures, which take 1 s."""
     command = [*ranks(n), str(Path(sys.executable).with_name("mpitled")), *map(str, arguments)]
+    if "run" in arguments[:1] and not pictures:
+        command += ["--set", "output.pictures=false"]
     done = subprocess.run(command, env=ENVIRONMENT, cwd=ROOT, timeout=timeout, capture_output=True, text=True)
     assert done.returncode == status, f"{command} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
     assert "Traceback" not in done.stderr

@@ -179,7 +179,7 @@ def grown(tmp_path_factory):
     """A tumour in a mixed block, run by the command; its folder and what was printed."""
     folder = tmp_path_factory.mktemp("grown")
     (folder / "scene.toml").write_text(GROWTH.format(elements="12, 10, 10", cloud="core"))
-    done = mpitled("run", folder / "scene.toml", "--out", folder / "out")
+    done = mpitled("run", folder / "scene.toml", "--out", folder / "out", pictures=True)
     return folder / "out", done.stdout
 
 
@@ -240,7 +240,7 @@ def test_pictures_show_the_cuts(grown):
 @pytest.mark.parametrize("cloud", ["none", "core", "all"])
 def test_scenes_without_a_tumour(tmp_path, cloud):
     (tmp_path / "scene.toml").write_text(SHEAR.format(cloud=cloud))
-    printed = mpitled("run", tmp_path / "scene.toml", "--out", tmp_path / "out").stdout
+    printed = mpitled("run", tmp_path / "scene.toml", "--out", tmp_path / "out", pictures=True).stdout
     made = strictly(tmp_path / "out" / "report.json")
     assert made.keys() >= ALWAYS
     assert not made.keys() & (OF_TUMOUR | OF_VENTRICLES)
