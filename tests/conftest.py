@@ -33,7 +33,7 @@ def ranks(n: int) -> list[str]:
 def mpitled(
     *arguments: object, n: int = 1, status: int = 0, timeout: float = 120, pictures: bool = False
 ) -> subprocess.CompletedProcess[str]:
-    """Run the command on n ranks and see that it ends with this status; runs leave out their pictures, which take 1 s."""
+    """Run the command on n ranks and see that it ends with this status; pictures take a run 1 s more."""
     command = [*ranks(n), str(Path(sys.executable).with_name("mpitled")), *map(str, arguments)]
     if "run" in arguments[:1] and not pictures:
         command += ["--set", "output.pictures=false"]
