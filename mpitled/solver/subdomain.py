@@ -19,8 +19,8 @@ from mpitled.store import PartRows
 SHORTEST_RUN = 4
 #: Costs in a step of relaxation, in those of a box in a run with its node: of a hexahedron that is gathered, and of
 #: each node of a support domain. A march asks 0.40 for that, single precision 0.26.
-GATHERED_COST = 3.0
-DOMAIN_NODE_COST = 0.32
+GATHERED_COST = 3.8
+DOMAIN_NODE_COST = 0.36
 #: Edges of a box agree this well relative to their length: the round-off of coordinates far from the origin.
 BOX_TOLERANCE = 1e-11
 #: What `solver.precision` means for the cells' arithmetic.
