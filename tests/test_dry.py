@@ -64,7 +64,7 @@ def test_a_dry_run_tells_the_terms_that_the_run_takes_and_takes_no_step(tmp_path
         assert result.n_frames == int(n)
     assert float(size) * {"kB": 1e3, "MB": 1e6}[unit] == pytest.approx((out / "result.vtkhdf").stat().st_size, rel=0.01)
     assert ("of domain_forces and domain_survey: support.stabilisation = 0" in told) == (cloud == "core")
-    assert ("pack, clear, unpack: one rank" in told) == (ranks == 1)
+    assert ("gather, add, add_gathered, scatter: one rank" in told) == (ranks == 1)
     assert ("follow: no node is turned" in told) == (cloud != "all")
     if ranks == 1:  # what the result tells of itself
         with open_result(out) as result:

@@ -92,7 +92,7 @@ def test_a_page_has_what_the_scene_has(brain, stopped):
     assert "A cylinder &lt;squeezed&gt; &amp; more" in text
     assert re.search(r"not complete: [\d.]+% of the load time: unstable at .*worst is", text)
     assert "drawn by matplotlib (PyVista found no way to draw here)" in text
-    assert "pack, clear, unpack: one rank" in text
+    assert "gather, add, add_gathered, scatter: one rank" in text
 
 
 @pytest.mark.parametrize("width", [1250, 600])

@@ -93,7 +93,10 @@ class Halo:
     """Sums of nodal values over the ranks that share a node, the same bits on each of them.
 
     Contributions are added in ascending order of rank, the own one in its turn (addition does not associate).
-    Requests are persistent and the buffers are made once: nothing is allocated in an exchange.
+    Requests are persistent and the buffers are made once: nothing is allocated in an exchange. Ranks of one host read
+    each other's buffers where they are, in memory that they share; their messages are empty and say that a buffer is
+    filled, so that nothing has to be moved while both compute. There are two buffers of each, used in turn: none is
+    written over while the other reads it, for a rank cannot be farther ahead than a message that follows the reading.
     """
 
     def __init__(
@@ -103,43 +106,101 @@ class Halo:
         components: int,
         precision: type[np.floating] = np.float64,
     ) -> None:
-        """shared: (rank, nodes shared with it) in ascending order of rank; both sides list the same nodes."""
-        self.components = components
+        """shared: (rank, ascending nodes shared with it), ranks ascending, alike on both sides. Collective."""
         self.seconds = {"pack": 0.0, "wait": 0.0, "unpack": 0.0}
         self._all = np.unique(np.concatenate([nodes for _, nodes in shared])) if shared else np.zeros(0, np.uint32)
-        own = np.empty((components, len(self._all)), precision)
-        self._own = own
-        sends = [np.empty((components, len(nodes)), precision) for _, nodes in shared]
-        receives = [np.empty((components, len(nodes)), precision) for _, nodes in shared]
-        self._packs = [(nodes, buffer) for (_, nodes), buffer in zip(shared, sends, strict=True)]
-        turns = [(rank, nodes, buffer) for (rank, nodes), buffer in zip(shared, receives, strict=True)]
-        turns.append((world.rank, self._all, own))
-        self._turns = [(nodes, buffer) for _, nodes, buffer in sorted(turns, key=lambda turn: turn[0])]
-        self._requests: list[Any] = []
+        self._total = np.empty((components, len(self._all)), precision)
+        buffers = {rank: np.empty((4, components, len(nodes)), precision) for rank, nodes in shared}
+        close = _shared_buffers(world, buffers)
+        self._turns = []
+        for turn in (0, 1):
+            sends: list[_Part] = []
+            below: list[_Part] = []
+            above: list[_Part] = []
+            requests: list[Any] = []
+            for rank, nodes in shared:
+                out, back = close[rank][turn] if rank in close else (buffers[rank][turn], buffers[rank][2 + turn])
+                sends.append((nodes, out))
+                places = np.searchsorted(self._all, nodes).astype(np.uint32)
+                (below if rank < world.rank else above).append((places, back))
+                message, answer = (_NOTHING, _NOTHING) if rank in close else (out, back)
+                requests += [world.comm.Recv_init(answer, rank), world.comm.Send_init(message, rank)]
+            self._turns.append((sends, below, above, requests))
         self._start: Callable[[list[Any]], None] = lambda requests: None
         self._wait: Callable[[list[Any]], Any] = lambda requests: None
         if shared:
             from mpi4py import MPI
 
-            comm = world.comm
-            self._requests = [comm.Recv_init(b, rank) for (rank, _), b in zip(shared, receives, strict=True)]
-            self._requests += [comm.Send_init(b, rank) for (rank, _), b in zip(shared, sends, strict=True)]
             self._start, self._wait = MPI.Prequest.Startall, MPI.Request.Waitall
 
-    def sum(self, values: NDArray[np.floating]) -> None:
+    def start(self, values: NDArray[np.floating]) -> None:
+        """Send what this rank has at shared nodes of values (components, n_nodes), which stays there until `finish`."""
+        begin = time.perf_counter()
+        sends, *_, requests = self._turns[0]
+        for nodes, buffer in sends:
+            kernels.gather(values, nodes, buffer)
+        self._start(requests)
+        self.seconds["pack"] += time.perf_counter() - begin
+
+    def finish(self, values: NDArray[np.floating]) -> None:
         """values (components, n_nodes) at shared nodes <- the sum over the ranks that share them."""
-        clock = time.perf_counter
-        begin = clock()
-        kernels.pack(values, self._all, self._own)
-        for nodes, buffer in self._packs:
-            kernels.pack(values, nodes, buffer)
-        packed = clock()
-        self._start(self._requests)
-        self._wait(self._requests)
-        waited = clock()
-        kernels.clear(values, self._all)
-        for nodes, buffer in self._turns:
-            kernels.unpack(values, nodes, buffer)
-        self.seconds["pack"] += packed - begin
-        self.seconds["wait"] += waited - packed
-        self.seconds["unpack"] += clock() - waited
+        begin = time.perf_counter()
+        _, below, above, requests = self._turns[0]
+        self._turns.reverse()
+        self._wait(requests)
+        waited = time.perf_counter()
+        self._total[:] = 0
+        for places, buffer in below:
+            kernels.add(buffer, places, self._total)
+        kernels.add_gathered(values, self._all, self._total)
+        for places, buffer in above:
+            kernels.add(buffer, places, self._total)
+        kernels.scatter(self._total, self._all, values)
+        self.seconds["wait"] += waited - begin
+        self.seconds["unpack"] += time.perf_counter() - waited
+
+    def sum(self, values: NDArray[np.floating]) -> None:
+        """Both at once."""
+        self.start(values)
+        self.finish(values)
+
+
+_NOTHING = np.empty(0)
+#: Nodes, or their places among all that are shared, and a buffer for them.
+_Part = tuple[NDArray[np.uint32], NDArray[np.floating]]
+_Pairs = tuple[tuple[NDArray[np.floating], NDArray[np.floating]], ...]
+
+
+def _shared_buffers(world: World, buffers: dict[int, NDArray[np.floating]]) -> dict[int, _Pairs]:
+    """By neighbour on this host, for each of two turns: the buffer that is written here, and the one that is read.
+
+    buffers: as large as they have to be, by neighbour. Collective.
+    """
+    if world.comm is None:
+        return {}
+    from mpi4py import MPI
+
+    host = world.comm.Split_type(MPI.COMM_TYPE_SHARED)
+    ranks = host.allgather(world.rank)
+    begins: dict[int, list[int]] = {}
+    end = 0
+    for rank in buffers:
+        if rank in ranks:
+            size = -(-buffers[rank][0].nbytes // _PAGE) * _PAGE
+            begins[rank] = [end, end + size]
+            end += 2 * size
+    window = MPI.Win.Allocate_shared(end, 1, comm=host)
+    of_all = dict(zip(ranks, host.allgather(begins), strict=True))
+
+    def buffer(writer: int, reader: int, turn: int) -> NDArray[np.floating]:
+        memory: Any
+        memory, _ = window.Shared_query(ranks.index(writer))
+        like = buffers[reader if writer == world.rank else writer][0]
+        return np.ndarray(like.shape, like.dtype, memory, of_all[writer][reader][turn])
+
+    here = world.rank
+    return {rank: tuple((buffer(here, rank, turn), buffer(rank, here, turn)) for turn in (0, 1)) for rank in begins}
+
+
+#: Buffers begin at pages: ranks that write do not share a line of a cache.
+_PAGE = 4096

@@ -81,36 +81,56 @@ def at_rest(sub: Subdomain, load_time: float, time_step: float) -> State:
 
 
 def compose_forces(sub: Subdomain, halo: Halo | None) -> tuple[Term, ...]:
-    """The terms that make the nodal forces, in order: each kind of cell that is there, then the halo's sum."""
+    """The terms that make the nodal forces, in order: each kind of cell that is there.
+
+    With a halo the cells that have shared nodes come first, and the others while their forces travel: a rank that was
+    held up for a moment does not hold up its neighbours.
+    """
+    if halo is None:
+        return _compose_cells(sub, slice(None), slice(None), slice(None))
+    borders = [cells.border if cells else 0 for cells in (sub.runs, sub.hexahedra, sub.domains)]
+    return (
+        *_compose_cells(sub, *(slice(n) for n in borders)),
+        ("halo", lambda s: halo.start(s.f)),
+        *_compose_cells(sub, *(slice(n, None) for n in borders)),
+        ("halo", lambda s: halo.finish(s.f)),
+    )
+
+
+def _compose_cells(sub: Subdomain, of_runs: slice, of_hexahedra: slice, of_domains: slice) -> tuple[Term, ...]:
+    """The terms of some runs, and some batches of hexahedra and support domains."""
     terms: list[Term] = []
     runs, hexahedra, domains = sub.runs, sub.hexahedra, sub.domains
-    if runs is not None:
+    if runs is not None and len(runs.length[of_runs]):
+        some = [
+            np.ascontiguousarray(a[..., of_runs])
+            for a in (runs.line, runs.length, runs.along, runs.scale, runs.coefficient)
+        ]
 
         def voxels(s: State) -> None:
-            J = kernels.voxel_forces(s.seen, s.f, runs.line, runs.length, runs.along, runs.scale, runs.coefficient)
+            J = kernels.voxel_forces(s.seen, s.f, *some)
             s.smallest_jacobian = min(s.smallest_jacobian, J)
 
         terms.append(("voxel hexahedra", voxels))
-    if hexahedra is not None:
+    if hexahedra is not None and len(hexahedra.nodes[of_hexahedra]):
+        of_cells = [
+            a[of_hexahedra] for a in (hexahedra.nodes, hexahedra.in_row, hexahedra.geometry, hexahedra.coefficient)
+        ]
 
         def general(s: State) -> None:
-            J = kernels.hexahedron_forces(
-                s.seen, s.f, hexahedra.nodes, hexahedra.in_row, hexahedra.geometry, hexahedra.coefficient
-            )
+            J = kernels.hexahedron_forces(s.seen, s.f, *of_cells)
             s.smallest_jacobian = min(s.smallest_jacobian, J)
 
         terms.append(("hexahedra", general))
-    if domains is not None:
+    if domains is not None and len(domains.nodes[of_domains]):
+        arrays = (domains.nodes, domains.gradient, domains.position, domains.inverse, domains.coefficient)
+        of_clouds = [None if a is None else a[of_domains] for a in arrays]
 
         def support_domains(s: State) -> None:
-            J = kernels.domain_forces(
-                s.seen, s.f, domains.nodes, domains.gradient, domains.position, domains.inverse, domains.coefficient,
-            )  # fmt: skip
+            J = kernels.domain_forces(s.seen, s.f, *of_clouds)
             s.smallest_jacobian = min(s.smallest_jacobian, J)
 
         terms.append(("support domains", support_domains))
-    if halo is not None:
-        terms.append(("halo", lambda s: halo.sum(s.f)))
     return tuple(terms)
 
 

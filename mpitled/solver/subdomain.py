@@ -45,6 +45,7 @@ class VoxelRuns:
     scale: NDArray[np.floating]  # (3, n_runs), 1/m
     coefficient: NDArray[np.floating]  # (3, n_runs)
     gram: NDArray[np.floating]  # (3, n_runs), 1/m^2
+    border: int  # so many of them, the first, have nodes that other ranks share
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +59,7 @@ class HexahedronBatches:
     coefficient: NDArray[np.floating]  # (n_batches, 3, lanes)
     gram: NDArray[np.floating]  # (n_batches, 6, lanes), 1/m^2
     stiffness: NDArray[np.floating]  # (n_batches, lanes), N/m
+    border: int  # as in `VoxelRuns`, of batches
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +74,7 @@ class DomainBatches:
     coefficient: NDArray[np.floating]  # (n_batches, 3, lanes)
     gram: NDArray[np.floating]  # (n_batches, 6, lanes), 1/m^2
     stiffness: NDArray[np.floating]  # (n_batches, lanes), N/m
+    border: int  # as in `VoxelRuns`, of batches
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +155,8 @@ def localise(
     breaks = _run_breaks(cells, box & (along >= 0), edges, rows.material[:n_hexahedra])
     in_runs = np.repeat(np.diff(breaks) >= SHORTEST_RUN, np.diff(breaks)) & box & (along >= 0)
     general = np.flatnonzero(~in_runs)
+    shared = np.zeros(len(rows.nodes), bool)
+    shared[local(rows.shared)] = True
     dofs = 3 * local(rows.prescribed_dofs // 3) + (rows.prescribed_dofs % 3).astype(np.uint32)
     turns = rows.prescribed_turns.any(axis=1)
     moves = (rows.prescribed_displacements != 0) | turns
@@ -159,12 +164,16 @@ def localise(
         rows=rows,
         n_nodes=len(rows.nodes),
         n_cells=len(rows.cells),
-        runs=_in(precision, _voxel_runs(cells, along, edges, lame[:, :n_hexahedra], breaks, in_runs, hourglass)),
+        runs=_in(
+            precision, _voxel_runs(cells, along, edges, lame[:, :n_hexahedra], breaks, in_runs, hourglass, shared)
+        ),
         hexahedra=_in(
             precision,
-            _hexahedron_batches(rows.points, cells, general, lame, len(rows.cells), hourglass, rule, precision),
+            _hexahedron_batches(rows.points, cells, general, lame, len(rows.cells), hourglass, rule, precision, shared),
         ),
-        domains=_in(precision, _domain_batches(rows, local(rows.domains), lame[:, n_hexahedra:], stabilisation)),
+        domains=_in(
+            precision, _domain_batches(rows, local(rows.domains), lame[:, n_hexahedra:], stabilisation, shared)
+        ),
         fixed=dofs[~moves],
         moving=dofs[moves],
         moving_full=rows.prescribed_displacements[moves],
@@ -196,7 +205,9 @@ def _in(precision: type[np.floating], cells: Any) -> Any:
         return None
     arrays = {f.name: getattr(cells, f.name) for f in fields(cells)}
     real = {
-        name: a.astype(precision, copy=False) for name, a in arrays.items() if a is not None and a.dtype.kind == "f"
+        name: a.astype(precision, copy=False)
+        for name, a in arrays.items()
+        if isinstance(a, np.ndarray) and a.dtype.kind == "f"
     }
     return replace(cells, **real)
 
@@ -243,10 +254,17 @@ def _voxel_runs(
     breaks: NDArray[np.int64],
     in_runs: NDArray[np.bool_],
     hourglass: float,
+    shared: NDArray[np.bool_],
 ) -> VoxelRuns | None:
     if not in_runs.any():
         return None
-    first = breaks[:-1][in_runs[breaks[:-1]]]
+    first, length = breaks[:-1], np.diff(breaks)
+    first, length = first[in_runs[first]], length[in_runs[first]]
+    near = np.take_along_axis(cells[first], _LINES[along[first], :, 0], axis=1).astype(np.int64)
+    before = np.concatenate([[0], np.cumsum(shared)])  # so many nodes before each are shared
+    at_border = (before[near + length[:, None] + 1] > before[near]).any(axis=1)
+    order = np.argsort(~at_border, kind="stable")
+    first, length, near = first[order], length[order], near[order]
     axis = along[first].astype(np.int64)
     # Axes in turn from that of the run.
     edge = np.take_along_axis(edges[first], (axis[:, None] + np.arange(3)) % 3, axis=1).T
@@ -254,8 +272,8 @@ def _voxel_runs(
     gram = 1 / (2 * edge**2)
     mu, lam = lame[:, first]
     return VoxelRuns(
-        line=np.ascontiguousarray(np.take_along_axis(cells[first], _LINES[axis, :, 0], axis=1).T, dtype=np.uint64),
-        length=np.diff(breaks)[in_runs[breaks[:-1]]].astype(np.uint64),
+        line=np.ascontiguousarray(near.T, dtype=np.uint64),
+        length=length.astype(np.uint64),
         along=axis.astype(np.uint64),
         first_cell=first.astype(np.uint64),
         scale=1 / (4 * edge),
@@ -263,6 +281,7 @@ def _voxel_runs(
             [mu * volume, lam * volume, hourglass * hourglass_modulus(lam, mu) * volume * gram.sum(axis=0) / 8]
         ),
         gram=gram,
+        border=int(np.count_nonzero(at_border)),
     )
 
 
@@ -275,6 +294,7 @@ def _hexahedron_batches(
     hourglass: float,
     rule: str,
     precision: type[np.floating],
+    shared: NDArray[np.bool_],
 ) -> HexahedronBatches | None:
     if len(chosen) == 0:
         return None
@@ -286,7 +306,9 @@ def _hexahedron_batches(
     k = hexahedra.hourglass_stiffness(gradients, volumes, hourglass_modulus(lam, mu), hourglass)
     geometry = np.concatenate([gradient_modes.reshape(-1, 18) / 8, x_modes.reshape(-1, 12)], axis=1)
     lanes = _lanes(nodes)
-    return HexahedronBatches(
+    return _border_first(
+        HexahedronBatches,
+        shared,
         nodes=lanes,
         in_row=_in_row(lanes, BITS // 8 // precision().itemsize),
         cells=_lanes(chosen[:, None].astype(np.uint32), n_cells)[:, 0],
@@ -316,7 +338,11 @@ def _in_row(nodes: NDArray[np.uint32], width: int) -> NDArray[np.bool_]:
 
 
 def _domain_batches(
-    rows: PartRows, nodes: NDArray[np.uint32], lame: NDArray[np.float64], stabilisation: float
+    rows: PartRows,
+    nodes: NDArray[np.uint32],
+    lame: NDArray[np.float64],
+    stabilisation: float,
+    shared: NDArray[np.bool_],
 ) -> DomainBatches | None:
     if len(nodes) == 0:
         return None
@@ -327,7 +353,9 @@ def _domain_batches(
     gram = np.einsum("gai,gaj->gij", rows.domain_gradients, rows.domain_gradients)
     numbers = np.arange(len(rows.hexahedra), len(rows.cells), dtype=np.uint32)
     stabilised = stabilisation > 0
-    return DomainBatches(
+    return _border_first(
+        DomainBatches,
+        shared,
         nodes=_lanes(nodes),
         cells=_lanes(numbers[:, None], len(rows.cells))[:, 0],
         gradient=_lanes(rows.domain_gradients),
@@ -337,6 +365,15 @@ def _domain_batches(
         gram=_lanes(_symmetric(gram)),
         stiffness=_lanes(kappa[:, None], 0)[:, 0],  # Q is a projector: its largest eigenvalue is one
     )
+
+
+def _border_first(kind: Any, shared: NDArray[np.bool_], **arrays: NDArray[Any] | None) -> Any:
+    """Batches of a kind from arrays of them, those with shared nodes before the others."""
+    at_border = shared[arrays["nodes"]].any(axis=(1, 2))
+    if not at_border.all() and at_border.any():
+        order = np.argsort(~at_border, kind="stable")
+        arrays = {name: None if array is None else array[order] for name, array in arrays.items()}
+    return kind(**arrays, border=int(np.count_nonzero(at_border)))
 
 
 def _symmetric(tensors: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -130,9 +130,10 @@ def reasons(deck: Deck, sub: Subdomain, ranks: int) -> dict[str, str]:
         "raise_mass": heavier,
         "renew_tensors": method,
         "watch_relaxation": method,
-        "pack": alone,
-        "clear": alone,
-        "unpack": alone,
+        "gather": alone,
+        "add": alone,
+        "add_gathered": alone,
+        "scatter": alone,
     }
 
 

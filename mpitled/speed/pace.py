@@ -181,7 +181,7 @@ def roofline(
     """
     work = pace.work()
     total = by_memory = 0.0
-    for name, _ in pace.terms:
+    for name in dict.fromkeys(name for name, _ in pace.terms):
         if name not in operations:
             continue
         arithmetic = operations[name] * work.get(name, pace.sub.n_nodes) / (2 * multiply_adds)

@@ -10,16 +10,17 @@ from mpitled.solver.kernels.domains import domain_forces, domain_survey
 from mpitled.solver.kernels.hexahedra import hexahedron_forces, hexahedron_survey, voxel_forces, voxel_survey
 from mpitled.solver.kernels.lanes import BATCH as BATCH_LANES
 from mpitled.solver.kernels.nodes import (
+    add,
+    add_gathered,
     change_step,
-    clear,
     follow,
+    gather,
     kinetic_energy,
-    pack,
     raise_mass,
     react,
     relax,
     renew_tensors,
-    unpack,
+    scatter,
     update,
     watch_relaxation,
 )  # fmt: skip
@@ -27,7 +28,7 @@ from mpitled.solver.kernels.nodes import (
 PADDING = BATCH_LANES  # the last vector of a run reads beyond the run's nodes, and adds nothing there
 
 __all__ = [
-    "BATCH_LANES", "PADDING", "change_step", "clear", "domain_forces", "domain_survey", "follow", "hexahedron_forces",
-    "hexahedron_survey", "kinetic_energy", "pack", "raise_mass", "react", "relax", "renew_tensors", "unpack", "update",
-    "voxel_forces", "voxel_survey", "watch_relaxation",
+    "BATCH_LANES", "PADDING", "add", "add_gathered", "change_step", "domain_forces", "domain_survey", "follow",
+    "gather", "hexahedron_forces", "hexahedron_survey", "kinetic_energy", "raise_mass", "react", "relax",
+    "renew_tensors", "scatter", "update", "voxel_forces", "voxel_survey", "watch_relaxation",
 ]  # fmt: skip

@@ -267,25 +267,32 @@ def watch_relaxation(u, u_prev, f, mass, mobility, counted, u_then, f_then):  # 
 
 
 @kernel
-def pack(values, nodes, buffer):  # type: ignore[no-untyped-def]
-    """buffer (k, n) <- values (k, :) at the nodes (n,)."""
+def gather(values, nodes, some):  # type: ignore[no-untyped-def]
+    """some (k, n) <- values (k, :) at the nodes (n,)."""
     for c in range(values.shape[0]):
         for i in range(U(nodes.size)):
-            buffer[c, i] = values[c, nodes[i]]
+            some[c, i] = values[c, nodes[i]]
 
 
 @kernel
-def clear(values, nodes):  # type: ignore[no-untyped-def]
-    """values (k, :) <- 0 at the nodes (n,)."""
-    zero = values.dtype.type(0)
+def add_gathered(values, nodes, some):  # type: ignore[no-untyped-def]
+    """some (k, n) += values (k, :) at the nodes (n,)."""
     for c in range(values.shape[0]):
         for i in range(U(nodes.size)):
-            values[c, nodes[i]] = zero
+            some[c, i] += values[c, nodes[i]]
 
 
 @kernel
-def unpack(values, nodes, buffer):  # type: ignore[no-untyped-def]
-    """values (k, :) += buffer (k, n) at the nodes (n,)."""
+def add(some, places, total):  # type: ignore[no-untyped-def]
+    """total (k, :) at the places (n,) += some (k, n)."""
+    for c in range(total.shape[0]):
+        for i in range(U(places.size)):
+            total[c, places[i]] += some[c, i]
+
+
+@kernel
+def scatter(some, nodes, values):  # type: ignore[no-untyped-def]
+    """values (k, :) at the nodes (n,) <- some (k, n)."""
     for c in range(values.shape[0]):
         for i in range(U(nodes.size)):
-            values[c, nodes[i]] += buffer[c, i]
+            values[c, nodes[i]] = some[c, i]
