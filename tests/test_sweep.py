@@ -21,6 +21,7 @@ from conftest import ENVIRONMENT, ROOT, complaint, mpitled
 from mpitled import open_sweep
 from mpitled.batch import cases, screen, summary, vary
 from mpitled.errors import InputError
+from mpitled.store import checkpoint_contents
 
 CUBE = ROOT / "jobs" / "validation" / "cube.toml"
 #: Three cases on one model; half the height in one step turns cells inside out.
@@ -272,3 +273,22 @@ def test_one_growth_is_for_slow_loading_to_volumes(tmp_path):
         done = mpitled("sweep", deck, *words, "--one-growth", "--out", tmp_path / "out", status=2)
         assert reason in complaint(done)
     assert not (tmp_path / "out").exists()
+
+
+def test_an_interrupted_case_goes_on_from_its_checkpoint(tmp_path):
+    deck, out = tmp_path / "scene.toml", tmp_path / "out"
+    deck.write_text(GROWTH)
+    words = ["sweep", deck, "--vary", "tumour.volume=150", "--set", "solver.load_time=5", "--out", out]
+    command = [str(Path(sys.executable).with_name("mpitled")), *map(str, words)]
+    with subprocess.Popen(command, env=ENVIRONMENT, cwd=ROOT, stderr=subprocess.DEVNULL) as process:
+        deadline = time.time() + 60
+        while not list(out.glob("*/result.partial.vtkhdf")) and time.time() < deadline:
+            time.sleep(0.02)
+        time.sleep(0.5)
+        process.send_signal(signal.SIGTERM)
+    assert process.returncode == 4
+    (kept,) = out.glob("*/checkpoint.h5")
+    step = checkpoint_contents(kept)["step"]
+    mpitled("sweep", out)
+    report = json.loads((kept.parent / "report.json").read_text())
+    assert report["resumed_at_step"] == step > 0

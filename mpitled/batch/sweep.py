@@ -20,7 +20,7 @@ from mpitled.batch import launch
 from mpitled.batch.cases import Case, Sweep, is_sweep
 from mpitled.batch.screen import Screen, share_done
 from mpitled.errors import InputError, InterruptedRun, MpitledError, everywhere
-from mpitled.solver import job
+from mpitled.solver import checkpoint, job
 from mpitled.solver.halo import World
 
 _WATCH = 0.2  # s between looks at what is at work
@@ -125,9 +125,24 @@ def _as_processes(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], jo
 
 
 def _start(sweep: Sweep, case: Case, verb: str) -> launch.Process:
-    folder = case.folder if verb == "run" else case.model
-    launch.prepare(folder, case.model / job.MODEL if verb == "run" and case.shares else None)
-    return launch.Process(launch.command(verb, sweep.deck, case.overrides, sweep.ranks, folder), folder)
+    if verb == "build":
+        launch.prepare(case.model)
+        folder, resume = case.model, False
+    else:
+        folder, resume = case.folder, _prepare(case)
+    return launch.Process(launch.command(verb, sweep.deck, case.overrides, sweep.ranks, folder, resume), folder)
+
+
+def _prepare(case: Case) -> bool:
+    """Make a case's folder ready; whether it goes on from the checkpoint that an interrupted run left in it."""
+    if case.failure is None:
+        try:
+            if checkpoint.find(case.folder, case.deck, store.model_key(case.folder / job.MODEL) or ""):
+                return True
+        except InputError:  # of another program, or damaged: begun anew
+            pass
+    launch.prepare(case.folder, case.model / job.MODEL if case.shares else None)
+    return False
 
 
 def _end(sweep: Sweep, case: Case, failure: str, screen: Screen) -> None:
@@ -175,12 +190,11 @@ def _build(sweep: Sweep, case: Case) -> None:
 
 def _run(sweep: Sweep, case: Case, group: World, screen: Screen, world: World) -> None:
     """Compute a case on a group's ranks; its error ends the case alone if all of the group know of it."""
-    if group.leads:
-        launch.prepare(case.folder, case.model / job.MODEL if case.shares else None)
+    resume = bool(group.broadcast(group.leads and _prepare(case)))
     failure = ""
     with _logged(case.folder / launch.LOG if group.leads else Path(os.devnull)):
         try:
-            job.run(case.deck, case.folder, group)
+            job.run(case.deck, case.folder, group, resume=resume)
         except InterruptedRun as error:
             _abandon(world, error)
         except Exception as error:
