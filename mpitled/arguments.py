@@ -118,6 +118,7 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
     bench.add_argument("--compare", type=Path, metavar="OLD.json", help="exit status 1 if a case is 10 %% slower")
     bench.add_argument("--ranks", metavar="N,...", help="numbers of ranks (1,2 where there are two cores)")
     bench.add_argument("--quick", action="store_true", help="the smallest of each scene, in less time")
+    bench.add_argument("--scaling", action="store_true", help="instead: ranks beside as many runs of one rank at once")
     bench.add_argument("--omissions", action="store_true", help="instead: what each thing costs that a scene can lack")
 
     predict = command("predict", "efficiency on a cluster, from real partitions in many parts")

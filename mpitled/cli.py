@@ -271,6 +271,12 @@ def _bench(options: argparse.Namespace) -> int:
         print(omissions.measure(options.quick))
         return 0
     ranks = _numbers("--ranks", options.ranks) if options.ranks else bench.default_ranks()
+    bench.check_ranks(ranks)
+    if options.scaling:
+        from mpitled.speed import scaling
+
+        print(scaling.measure(ranks, options.quick))
+        return 0
     old = bench.load(options.compare) if options.compare else None
     outcome = bench.bench(ranks, options.quick, old)
     print(bench.table(outcome))

@@ -93,6 +93,17 @@ def test_every_omission_is_left_out_of_the_step_with_everything_on(small, capfd)
     assert gains["all of these"] > gains["(everything on)"] == 1
 
 
+def test_ranks_are_held_against_as_many_runs_of_one(small, capfd):
+    ranks(2)
+    assert ended("bench", "--quick", "--scaling", "--ranks", "2") == 0
+    rows = [row.split() for row in capfd.readouterr().out.splitlines()[1:]]
+    assert [row[:3] for row in rows] == [["strong", "mixed", "2"], ["strong", "voxel", "2"], ["weak", "voxel", "2"]]
+    assert [row[3] for row in rows[1:]] == ["512", "1024"]
+    for *_, rate, apart, efficiency, halo in rows:
+        assert min(float(rate), float(apart), float(efficiency[:-1])) > 0
+        assert 0 < float(halo[:-1]) < 100
+
+
 @pytest.mark.parametrize(("arguments", "words"), [
     (["--ranks", "0"], "whole numbers above 0"),
     (["--compare", "no.json"], "no.json"),

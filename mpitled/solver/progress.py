@@ -78,7 +78,7 @@ class Progress:
             self.bar.update(max(0.0, done - self.bar.n))
         elif int(10 * done) > self.tenth:
             self.tenth = int(10 * done)
-            left = (1 - done) / done * (time.perf_counter() - self.begin)
+            left = max(0.0, (1 - done) / done * (time.perf_counter() - self.begin))
             print(f"{done:4.0%}  {left:5.0f} s left  {state}", file=sys.stderr, flush=True)
 
     def tell(self, words: str) -> None:

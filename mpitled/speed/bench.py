@@ -27,11 +27,9 @@ from mpitled.speed import flops
 
 #: A case is slower than it was below this share of its speed. Medians of two runs on a quiet machine differ by 5 %.
 SLOWER = 0.9
+RATE = "million_cell_updates_per_second_per_core"
 #: What is written of each case.
-COLUMNS = (
-    "scene", "cells", "precision", "ranks", "million_cell_updates_per_second_per_core", "bytes_per_cell", "halo_share",
-    "roofline_share",
-)  # fmt: skip
+COLUMNS = ("scene", "cells", "precision", "ranks", RATE, "bytes_per_cell", "halo_share", "roofline_share")
 #: Nodes of a support domain in the cloud: the paper's.
 DOMAIN_NODES = 8
 #: What makes two cases the same.
@@ -89,15 +87,19 @@ def default_ranks() -> list[int]:
     return [1, 2] if (os.cpu_count() or 1) > 1 and shutil.which("mpirun") else [1]
 
 
+def check_ranks(ranks: Sequence[int]) -> None:
+    """InputError unless so many ranks can be started here."""
+    if World().size > 1:
+        raise InputError("bench: starts ranks of its own; run it without mpirun, with --ranks 1,2")
+    if max(ranks) > 1 and shutil.which("mpirun") is None:
+        raise InputError("bench: there is no mpirun for more than one rank; give --ranks 1")
+
+
 def bench(ranks: Sequence[int], quick: bool, old: dict[str, Any] | None = None) -> dict[str, Any]:
     """Build the scenes and time every case on each number of ranks: what is written as JSON.
 
     Cases that look slower than in an `old` outcome are timed once more, and the better counts.
     """
-    if World().size > 1:
-        raise InputError("bench: starts ranks of its own; run it without mpirun, with --ranks 1,2")
-    if max(ranks) > 1 and shutil.which("mpirun") is None:
-        raise InputError("bench: there is no mpirun for more than one rank; give --ranks 1")
     with tempfile.TemporaryDirectory(prefix="mpitled-bench-") as name:
         folder = Path(name)
         scenes = []
@@ -108,8 +110,8 @@ def bench(ranks: Sequence[int], quick: bool, old: dict[str, Any] | None = None) 
                 for n in ranks:
                     if n > 1:
                         job.divide(Path(scenes[-1]["model"]), n, 0)
-        task = {"scenes": scenes, "operations": _operations(folder), "quick": quick}
-        outcomes = [_timed(folder, task, n) for n in ranks]
+        task = {"scenes": scenes, "operations": operations(folder), "quick": quick}
+        outcomes = [timed(folder, task, n)[0] for n in ranks]
         result = {
             "machine": _machine(),
             "commit": _commit(),
@@ -120,7 +122,7 @@ def bench(ranks: Sequence[int], quick: bool, old: dict[str, Any] | None = None) 
             slower = {case["scene"] for case, ratio in compared(result, old) if ratio < SLOWER and case["ranks"] == n}
             if slower:
                 task["scenes"] = [each for each in scenes if each["scene"] in slower]
-                _keep_better(result["cases"], _timed(folder, task, n)["cases"])
+                _keep_better(result["cases"], timed(folder, task, n)[0]["cases"])
         return result
 
 
@@ -128,14 +130,16 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def _timed(folder: Path, task: dict[str, Any], ranks: int) -> dict[str, Any]:
+def timed(folder: Path, task: dict[str, Any], ranks: int, copies: int = 1) -> list[dict[str, Any]]:
+    """What each of some copies at once of a program on so many ranks finds of its scenes: see `pace.main`."""
     path = folder / "task.json"
     path.write_text(json.dumps(task))
     words = [*launch.ranked(ranks), sys.executable, "-c", "from mpitled.speed.pace import main; main()", str(path)]
-    done = subprocess.run(words, stdout=subprocess.PIPE, text=True)
-    if done.returncode:
-        raise RuntimeError(f"bench: {ranks} ranks ended with {done.returncode}")
-    return dict(json.loads(done.stdout))
+    started = [subprocess.Popen(words, stdout=subprocess.PIPE, text=True) for _ in range(copies)]
+    said = [process.communicate()[0] for process in started]
+    if failed := [process.returncode for process in started if process.returncode]:
+        raise RuntimeError(f"bench: {ranks} ranks ended with {failed[0]}")
+    return [dict(json.loads(text)) for text in said]
 
 
 def _key(case: dict[str, Any]) -> tuple[Any, ...]:
@@ -143,23 +147,22 @@ def _key(case: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def _keep_better(cases: list[dict[str, Any]], again: list[dict[str, Any]]) -> None:
-    rate = COLUMNS[4]
     for case in again:
         i = [_key(known) for known in cases].index(_key(case))
-        cases[i] = max(cases[i], case, key=lambda known: known[rate])
+        cases[i] = max(cases[i], case, key=lambda known: known[RATE])
 
 
 def compared(new: dict[str, Any], old: dict[str, Any] | None) -> list[tuple[dict[str, Any], float]]:
     """The cases that both outcomes have, with their speed over what it was."""
-    known = {_key(case): case[COLUMNS[4]] for case in (old or {"cases": ()})["cases"]}
-    return [(case, case[COLUMNS[4]] / known[_key(case)]) for case in new["cases"] if _key(case) in known]
+    known = {_key(case): case[RATE] for case in (old or {"cases": ()})["cases"]}
+    return [(case, case[RATE] / known[_key(case)]) for case in new["cases"] if _key(case) in known]
 
 
 def load(path: Path) -> dict[str, Any]:
     """An outcome that `write` wrote. InputError if it is none."""
     try:
         outcome = json.loads(path.read_text())
-        if {(*_key(case), case[COLUMNS[4]]) for case in outcome["cases"]}:
+        if {(*_key(case), case[RATE]) for case in outcome["cases"]}:
             return dict(outcome)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}; give what 'mpitled bench --json FILE' wrote") from None
@@ -191,7 +194,7 @@ def table(outcome: dict[str, Any]) -> str:
         bound = "memory" if memory > 0.9 else "arithmetic" if memory < 0.1 else f"memory {memory:.0%}, arithmetic"
         lines.append(
             f"{case['scene']:11}{case['cells']:8} {case['precision']:10}{case['ranks']:6}"
-            f"{case[COLUMNS[4]]:16.1f}{case['bytes_per_cell']:12.0f}{case['halo_share']:8.1%}"
+            f"{case[RATE]:16.1f}{case['bytes_per_cell']:12.0f}{case['halo_share']:8.1%}"
             f"{case['roofline_share']:10.0%}  {bound}"
         )
     return "\n".join(lines)
@@ -271,7 +274,7 @@ def _deck(folder: Path, scene: str, size: Any, nodes: int) -> Deck:
     return load_deck(path)
 
 
-def _operations(folder: Path) -> dict[str, dict[str, float]]:
+def operations(folder: Path) -> dict[str, dict[str, float]]:
     """Floating-point operations of each term, per cell or node, by scene."""
     scenes = [scene(folder / f"count-{kind}", kind, size) for kind, size in _COUNTED.items()]
     default = scene(folder / "count-mixed", "cloud", _COUNTED["cloud"], Support().nodes)
