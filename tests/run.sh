@@ -7,4 +7,4 @@ set -euo pipefail
 ruff check .
 ruff format --check .
 mypy
-pytest "$@"
+pytest -n auto --dist loadfile "$@" # a file of tests on each core

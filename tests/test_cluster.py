@@ -80,7 +80,7 @@ def begun(folder: Path) -> bool:
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_a_job_ends_in_order_before_its_time_is_up(tmp_path, script):
     """SLURM sends a signal; PBS sends none in time, so that the script has a clock."""
-    words, variables = cluster(tmp_path, script, RUN_SECONDS="15", SET="solver.load_time=5000.0")
+    words, variables = cluster(tmp_path, script, RUN_SECONDS="10", SET="solver.load_time=5000.0")
     if script == "slurm.sh":
         words += ["--set", "solver.load_time=5000.0"]
     folder = tmp_path / "out" / "scene"

@@ -59,8 +59,10 @@ cloud = "core"
 [tumour]
 centre = [24.0, 20.0, 20.0]
 volume = {volume}
+surface_nodes = 400
 [cloud]
 radius = 11.0
+growth = 0.35
 [material.brain]
 youngs_modulus = 3000.0
 poissons_ratio = 0.49
@@ -234,8 +236,8 @@ def test_copies_of_shared_nodes_have_the_same_bits(tmp_path, n):
 def test_ranks_without_one_kind_of_cell(tmp_path):
     """A cloud at one end: of four parts some have no support domains, or no hexahedra."""
     text = GROWTH.replace("[48.0, 40.0, 40.0]", "[320.0, 20.0, 20.0]").replace("[12, 10, 10]", "[80, 5, 5]")
-    text = text.replace("[24.0, 20.0, 20.0]", "[12.0, 10.0, 10.0]").replace("[cloud]", "surface_nodes = 100\n[cloud]")
-    text = text.replace("radius = 11.0", "radius = 9.0\ngrowth = 0.5\npoints_per_spacing = 1.2")
+    text = text.replace("[24.0, 20.0, 20.0]", "[12.0, 10.0, 10.0]").replace("surface_nodes = 400", "surface_nodes = 100")
+    text = text.replace("radius = 11.0\ngrowth = 0.35", "radius = 9.0\ngrowth = 0.5\npoints_per_spacing = 1.2")
     path = deck(tmp_path, text, volume=60.0)
     for n in (1, 4):
         mpitled("run", path, "--out", tmp_path / str(n), n=n)
@@ -329,7 +331,7 @@ def test_an_unstable_run_stops_and_says_why(tmp_path, n):
 ])  # fmt: skip
 def test_an_unstable_run_recovers_on_request(tmp_path, method, keys):
     """It ends where a slow, safe run ends, within what both say is left to the static solution."""
-    path = deck(tmp_path, GROWTH, volume=523.6)
+    path = deck(tmp_path, GROWTH.replace("growth = 0.35", "").replace("surface_nodes = 400", ""), volume=523.6)
     words = [word for key in (f"solver.method={method}", *keys) for word in ("--set", key)]
     mpitled("run", path, "--out", tmp_path / "stops", *words, status=3)
     mpitled("run", path, "--out", tmp_path / "recovers", *words, "--set", "solver.on_inversion=recover")

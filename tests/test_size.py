@@ -1,0 +1,80 @@
+"""Size: memory and time that a model of millions of cells takes to be built, cut and run, by cell. Long: -m study."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import ENVIRONMENT, ROOT
+
+BLOCK = """
+[block]
+size = [100.0, 100.0, 100.0]
+elements = [{n}, {n}, {n}]
+[material.brain]
+youngs_modulus = 3000.0
+poissons_ratio = 0.49
+[[fixed]]
+nodes = "z0"
+[[displaced]]
+nodes = "z1"
+directions = ["z"]
+displacement = [-1.0]
+"""
+#: A few steps of the ramp, which keeps no states to go back to.
+SHORT = ("solver.method=quasi-static", "solver.load_time=0.02", "output.frames=1", "output.pictures=false")
+
+
+def taken(*words: object) -> tuple[float, int]:
+    """Seconds of the command, and the bytes of memory that it took at most."""
+    begin = time.perf_counter()
+    command = [str(Path(sys.executable).with_name("mpitled")), *map(str, words)]
+    with subprocess.Popen(command, env=ENVIRONMENT, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+    assert process.returncode == 0
+    return time.perf_counter() - begin, 1024 * used.ru_maxrss
+
+
+def cells_and_memory(deck: Path, out: Path, *keys: str) -> tuple[int, int]:
+    """Of a run on one rank of a model that is there."""
+    taken("run", deck, "-q", "--out", out, *(word for key in (*SHORT, *keys) for word in ("--set", key)))
+    report = json.loads((out / "report.json").read_text())
+    return sum(report["cells"].values()), report["peak_memory_bytes"][0]
+
+
+@pytest.mark.study
+def test_four_million_voxels(tmp_path):
+    memory = {}
+    for n in (100, 159):
+        deck, out = tmp_path / f"{n}.toml", tmp_path / str(n)
+        deck.write_text(BLOCK.format(n=n))
+        built, cut = taken("build", deck, "--out", out), taken("partition", out, 2)
+        print(f"{n**3} cells: built in {built[0]:.1f} s and {built[1] / 1e9:.2f} GB, cut in {cut[0]:.1f} s and "
+              f"{cut[1] / 1e9:.2f} GB")  # fmt: skip
+        memory[n] = (*cells_and_memory(deck, out), built[1])
+        print(f"{memory[n][0]} cells: {memory[n][1] / 1e6:.0f} MB in a run of one rank")
+    assert built[0] + cut[0] < 180
+    assert max(built[1], cut[1]) < 6 << 30
+    cells = memory[159][0] - memory[100][0]
+    run, build = ((memory[159][k] - memory[100][k]) / cells for k in (1, 2))
+    print(f"by cell: {build:.0f} bytes to be built, {run:.0f} to be run")
+    assert build < 1024
+    assert run < 150
+
+
+@pytest.mark.study
+def test_the_brain_at_two_sizes(tmp_path):
+    """Mixed: the share of support domains falls with the size of hexahedra, as it does in practice."""
+    memory = []
+    for size in (4.0, 2.0):
+        key = f"labels.element_size={size}"
+        memory.append(cells_and_memory(ROOT / "jobs" / "brain_tumour.toml", tmp_path / str(size), key))
+    (few, small), (many, large) = memory
+    print(f"{few} to {many} cells: {(large - small) / (many - few):.0f} bytes a cell")
+    assert (large - small) / (many - few) < 450
