@@ -236,7 +236,9 @@ def test_copies_of_shared_nodes_have_the_same_bits(tmp_path, n):
 def test_ranks_without_one_kind_of_cell(tmp_path):
     """A cloud at one end: of four parts some have no support domains, or no hexahedra."""
     text = GROWTH.replace("[48.0, 40.0, 40.0]", "[320.0, 20.0, 20.0]").replace("[12, 10, 10]", "[80, 5, 5]")
-    text = text.replace("[24.0, 20.0, 20.0]", "[12.0, 10.0, 10.0]").replace("surface_nodes = 400", "surface_nodes = 100")
+    text = text.replace("[24.0, 20.0, 20.0]", "[12.0, 10.0, 10.0]").replace(
+        "surface_nodes = 400", "surface_nodes = 100"
+    )
     text = text.replace("radius = 11.0\ngrowth = 0.35", "radius = 9.0\ngrowth = 0.5\npoints_per_spacing = 1.2")
     path = deck(tmp_path, text, volume=60.0)
     for n in (1, 4):
