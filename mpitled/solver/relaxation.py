@@ -63,7 +63,8 @@ class Relaxation:
         halo: Halo | None,
     ) -> None:
         """halo sums six components."""
-        self.sub, self.halo, self.safety, self.frames = sub, halo, solver.safety, frames
+        self.sub, self.halo, self.frames = sub, halo, frames
+        self.safety = self.first_safety = solver.safety
         self.tolerance = solver.tolerance
         # Where the pace is its own, it is for it to find a slower one.
         self.recovers = solver.on_inversion == "recover" or solver.load_steps == "auto"
@@ -163,11 +164,14 @@ class Relaxation:
             "residual": residual,
         }
 
-    def harden(self) -> None:
-        """Go on from rest, with masses twice as large and the load half as fast, watched twice as often."""
+    def harden(self, anew: bool) -> None:
+        """Go on from rest with the load half as fast, and with masses twice as large, watched twice as often.
+
+        anew: from where the load began, with masses and watch as at first.
+        """
         self.state.place(self.state.u)
-        self.safety /= math.sqrt(2)
-        self.between = max(1, self.between // 2)
+        self.safety = self.first_safety if anew else self.safety / math.sqrt(2)
+        self.between = BETWEEN if anew else max(1, self.between // 2)
         self.load_time *= 2
         self.state.time *= self.load_time / self.state.load_time
         self.state.load_time = self.load_time
