@@ -45,8 +45,8 @@ COLUMNS = (
 TRUE_TO = 3.0
 #: Errors below this share of the body's size are round-off of some thousand steps.
 ROUND_OFF = 1e-9
-#: s of computing, after which a run of seconds hangs.
-HANGS = 60
+#: s of computing, after which a run hangs: most take seconds, those whose load is begun anew a minute.
+HANGS = 300
 #: What makes the references that are runs.
 _OTHERWISE = {
     "relaxed": ("solver.method=dynamic-relaxation", "solver.tolerance=1e-4", "solver.load_steps=2000"),

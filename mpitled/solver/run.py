@@ -29,9 +29,9 @@ from mpitled.solver.step import State, Term
 from mpitled.solver.subdomain import Subdomain
 from mpitled.solver.watch import BALANCE_LIMIT, Watch
 
-#: Looks from one state that recovery can go back to until the next; how often a run may go back, and how many of these
-#: times only a little: a load that still fails then has spoilt what it goes back to, and a relaxation begins it anew.
-SAVED, RECOVERIES, A_LITTLE = 5, 5, 2
+#: Looks from one state that recovery can go back to until the next; how often a run may go back; and which time a
+#: relaxation begins its load anew, for what it went back to was spoilt if the load still fails.
+SAVED, RECOVERIES, ANEW = 5, 5, 3
 #: A state whose energies are farther out of balance, as a share of what ends a run, is ill already.
 HEALTHY = 0.2
 #: What a run is asked at a look: nothing, to keep a checkpoint, to keep one and end.
@@ -202,7 +202,7 @@ class Run:
                     self._write_last_good(writer)
                     raise
                 self.recoveries += 1
-                anew = self.recoveries > A_LITTLE and self.loaded is None
+                anew = self.recoveries == ANEW and self.loaded is None
                 while len(self.saved) > 1:
                     self.saved.pop()
                 if anew and isinstance(method, Relaxation):
