@@ -138,7 +138,7 @@ def compute(outcome: Outcome) -> dict[str, Any]:
             report["max_displacement_outside_first_ring_mm"] = 1e3 * float(outside.max())
     if model.n_nodes > model.n_fe_nodes:
         # What the cloud's polynomials leave of the values that they are fitted to: where that is much they cannot
-        # follow the field, which is then wrong by about as much (0.8 to 3.5 times around 14 grown tumours).
+        # follow the field, which is then wrong by about as much (told 0.8 to 3.8 times, in 14 grown spheres).
         misfit = np.linalg.norm((outcome.field - outcome.displacement)[model.n_fe_nodes :], axis=1)
         report["cloud_misfit_mm"] = 1e3 * float(misfit.max())
     report |= _ventricles(outcome, fe_volumes)
