@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mpitled.batch.exact import shell
 from mpitled.deck import load_deck
 from mpitled.solver import job
 from mpitled.solver.halo import World
-from mpitled.store import open_result
+from mpitled.store import open_result, read_model
 
 BRAIN = """
 [material.brain]
@@ -61,6 +62,17 @@ surface_nodes = 200
 [cloud]
 radius = 12.0
 growth = 0.3
+[[fixed]]
+nodes = "surface"
+"""
+SPHERE = """
+[ellipsoid]
+semi_axes = [30.0, 30.0, 30.0]
+element_size = 5.0
+cloud = "core"
+[tumour]
+centre = [0.0, 0.0, 0.0]
+volume = {volume}
 [[fixed]]
 nodes = "surface"
 """
@@ -122,3 +134,16 @@ def test_a_ramp_of_twice_the_steps_of_a_relaxation_is_farther_from_static(comput
     ramp, u = compute(text, ramped, f"solver.load_time={2 * load_time * relaxation['steps'] / ramp['steps']}")
     assert ramp["steps"] > 1.9 * relaxation["steps"]
     assert distance(u, static) > 0.01
+
+
+@pytest.mark.parametrize(("radius", "warned"), [(5.0, False), (10.0, True)])
+def test_what_a_cloud_is_wrong_by_is_told(compute, tmp_path, radius, warned):
+    """Its misfit is true to a factor of 3, and warned of where it is large."""
+    volume = 4e-9 / 3 * np.pi * radius**3
+    made, _ = compute(SPHERE.format(volume=1e9 * volume), RELAXED)
+    with open_result(tmp_path / "out") as result:
+        field, model = result.at_nodes("field_displacement", -1), read_model(tmp_path / "out" / "model.h5")
+    error = 1e3 * distance(field, shell(model, model.points, volume))
+    print(f"{radius} mm: {made['cloud_misfit_mm']:.3f} mm told, {error:.3f} mm true")
+    assert error / 3 < made["cloud_misfit_mm"] < 3 * error
+    assert any("too coarse for its field" in warning for warning in made["warnings"]) == warned

@@ -89,7 +89,7 @@ def held(folder: Path) -> tuple[list[bytes], dict[str, Any]]:
     (RAMP, 4.0, 0.0),  # and on to the distance of its end from the static solution
     ('method = "dynamic"\nhold_time = 0.05', 4.0, 30.0),
     ('method = "dynamic-relaxation"\nprecision = "single"\ntolerance = 0.05', 4.0, 30.0),
-    ('method = "dynamic-relaxation"\nload_steps = 20\non_inversion = "recover"', 14.0, 0.0),
+    ('method = "dynamic-relaxation"\nload_steps = 5\non_inversion = "recover"', 14.0, 0.0),
 ])  # fmt: skip
 def test_a_run_goes_on_to_the_same_bits(tmp_path, monkeypatch, solver, millimetres, degrees):
     """Stopped three times: early, in the middle and late."""
@@ -97,9 +97,9 @@ def test_a_run_goes_on_to_the_same_bits(tmp_path, monkeypatch, solver, millimetr
     deck.write_text(BLOCK.format(solver=solver, millimetres=millimetres, degrees=degrees))
     whole = run(deck, tmp_path / "whole", monkeypatch)
     if "recover" in solver:
-        assert whole["recoveries"] > 0
-    looks = [run(deck, tmp_path / "part", monkeypatch, 2)]
-    for share in (0.4, 0.55):
+        assert whole["recoveries"] > 2  # twice a little, then from the beginning
+    looks = [run(deck, tmp_path / "part", monkeypatch, 10)]
+    for share in (0.3, 0.4):
         looks.append(run(deck, tmp_path / "part", monkeypatch, int(share * whole["looks"]), resume=True))
     assert isinstance(looks[-1], int), "was not stopped"
     report = run(deck, tmp_path / "part", monkeypatch, resume=True)

@@ -45,8 +45,8 @@ COLUMNS = (
 TRUE_TO = 3.0
 #: Errors below this share of the body's size are round-off of some thousand steps.
 ROUND_OFF = 1e-9
-#: s of computing, after which a run of seconds hangs.
-HANGS = 60
+#: s of computing, after which a run hangs: most take seconds, those whose load is begun anew a minute.
+HANGS = 300
 #: What makes the references that are runs.
 _OTHERWISE = {
     "relaxed": ("solver.method=dynamic-relaxation", "solver.tolerance=1e-4", "solver.load_steps=2000"),
@@ -78,7 +78,14 @@ class Case:
     @property
     def words(self) -> list[str]:
         """What `--set` takes, shares of the critical step not yet worked out, and words of the grid."""
-        return [*self.axis.values[self.value].split(), *KINDS[self.axis.geometry][self.kind].split()]
+        words = [*self.axis.values[self.value].split(), *KINDS[self.axis.geometry][self.kind].split()]
+        return [word for word in words if not word.startswith("reference.")]
+
+    @property
+    def reference_words(self) -> list[str]:
+        """What `--set` takes besides for the run that is the reference."""
+        words = self.axis.values[self.value].split()
+        return [f"solver.{word.removeprefix('reference.')}" for word in words if word.startswith("reference.")]
 
 
 def cases(only: Sequence[str] = ()) -> Iterator[Case]:
@@ -247,7 +254,7 @@ def _reference(case: Case, runs: _Runs, folder: Path) -> tuple[NDArray[np.float6
         return exact, 1e3 * float(np.abs(interpolated - CLOSED_FORMS[name](model, at, volume)).max())
     fields, steps, distance = [], [_figures(folder)["time_step_s"]], 0.0
     for other in (name, "half") if name == "quarter" else (name,):
-        found, failure = runs.run(other, *_OTHERWISE[other])
+        found, failure = runs.run(other, *_OTHERWISE[other], *case.reference_words)
         if failure:
             raise MpitledError(f"there is no reference: {failure}")
         figures = _figures(found)

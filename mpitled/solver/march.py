@@ -176,7 +176,7 @@ class March:
             self._take(self._fitting(allowed, self.frame * self.frame_span - s.time))
         return due, False
 
-    def harden(self) -> None:
+    def harden(self, _: bool) -> None:
         """Go on with steps shorter by a third, or twice the mass where the step needs it, watched twice as often."""
         self.safety /= math.sqrt(2)
         if not self.scales_mass:

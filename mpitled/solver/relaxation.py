@@ -30,6 +30,9 @@ SETTLED, STEADY = 50, 0.1
 STRAIN_PER_STEP, SHEAR_CELLS = 0.1, 14
 #: It has stalled when so many surveys in a row have not brought the least estimate down by this factor: round-off.
 STALLED, BETTER = 300, 0.99
+#: The least estimate counts for nothing when the lowest eigenvalue has fallen to this share of what it was then: a mode
+#: has come to light that is slower than what the estimate was made of.
+FALLEN = 0.5
 
 
 class Relaxation:
@@ -44,7 +47,10 @@ class Relaxation:
     """
 
     #: Beside the state: what an unstable run goes back to, and what stays as it is when it does.
-    PASSING = Kept(nodes=("u_then", "f_then"), alike=("lowest", "distance", "frame", "settled", "best", "waited"))
+    PASSING = Kept(
+        nodes=("u_then", "f_then"),
+        alike=("lowest", "distance", "frame", "settled", "best", "best_lowest", "waited"),
+    )
     LASTING = Kept(alike=("safety", "between", "load_time"))
 
     def __init__(
@@ -57,7 +63,8 @@ class Relaxation:
         halo: Halo | None,
     ) -> None:
         """halo sums six components."""
-        self.sub, self.halo, self.safety, self.frames = sub, halo, solver.safety, frames
+        self.sub, self.halo, self.frames = sub, halo, frames
+        self.safety = self.first_safety = solver.safety
         self.tolerance = solver.tolerance
         # Where the pace is its own, it is for it to find a slower one.
         self.recovers = solver.on_inversion == "recover" or solver.load_steps == "auto"
@@ -72,7 +79,7 @@ class Relaxation:
         self.counted: NDArray[np.float64] = self.free * sub.rows.owned  # free dofs that this rank owns
         self.u_then, self.f_then = np.zeros((3, sub.n_nodes)), np.zeros((3, sub.n_nodes))
         self.lowest, self.distance, self.frame, self.settled = 0.0, math.inf, 0, 0
-        self.best, self.waited = math.inf, 0
+        self.best, self.best_lowest, self.waited = math.inf, 0.0, 0
         self.forces, self.motion = compose_forces(sub, force_halo), compose_relaxation(sub, self.counted)
         self.sharpness = Sharpness(sub, world, self.forces, self.free)
 
@@ -157,11 +164,14 @@ class Relaxation:
             "residual": residual,
         }
 
-    def harden(self) -> None:
-        """Go on from rest, with masses twice as large and the load half as fast, watched twice as often."""
+    def harden(self, anew: bool) -> None:
+        """Go on from rest with the load half as fast, and with masses twice as large, watched twice as often.
+
+        anew: from where the load began, with masses and watch as at first.
+        """
         self.state.place(self.state.u)
-        self.safety /= math.sqrt(2)
-        self.between = max(1, self.between // 2)
+        self.safety = self.first_safety if anew else self.safety / math.sqrt(2)
+        self.between = BETWEEN if anew else max(1, self.between // 2)
         self.load_time *= 2
         self.state.time *= self.load_time / self.state.load_time
         self.state.load_time = self.load_time
@@ -186,7 +196,7 @@ class Relaxation:
         """Damping of the next steps; whether a frame is due now, and whether the static solution is reached."""
         s = self.state
         known = figures["rayleigh_force"] / figures["rayleigh_mass"] if figures["rayleigh_mass"] > 0 else 0.0
-        loaded, steady = s.share >= 1, False
+        loaded, steady, before = s.share >= 1, False, self.distance
         if loaded:
             if known > 0:
                 steady = abs(known - self.lowest) < STEADY * self.between / BETWEEN * self.lowest
@@ -199,10 +209,12 @@ class Relaxation:
             self.settled = self.settled + self.between if steady and self.distance < self.tolerance else 0
         damping = 2 * math.sqrt(self.lowest)
         s.retain, s.gain = (2 - damping) / (2 + damping), 2 / (2 + damping)
-        if steady and self.distance < BETTER * self.best:
-            self.best, self.waited = self.distance, 0
+        if steady and (self.distance < BETTER * self.best or self.lowest < FALLEN * self.best_lowest):
+            self.best, self.best_lowest, self.waited = self.distance, self.lowest, 0
         self.waited += loaded
-        if self.settled >= SETTLED or self.stalled:
+        # An estimate that grows is being overtaken by a slower mode, which that of the eigenvalue has not found yet.
+        shrinks = self.distance <= max(before, 1e-6 * self.tolerance)
+        if (self.settled >= SETTLED and shrinks) or self.stalled:
             return True, True
         due = self.frame < self.frames and s.share >= self.frame / self.frames
         self.frame += due

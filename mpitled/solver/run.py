@@ -29,8 +29,9 @@ from mpitled.solver.step import State, Term
 from mpitled.solver.subdomain import Subdomain
 from mpitled.solver.watch import BALANCE_LIMIT, Watch
 
-#: Looks from one state that recovery can go back to until the next, and how often a run may go back.
-SAVED, RECOVERIES = 5, 5
+#: Looks from one state that recovery can go back to until the next; how often a run may go back; and which time a
+#: relaxation begins its load anew, for what it went back to was spoilt if the load still fails.
+SAVED, RECOVERIES, ANEW = 5, 5, 3
 #: A state whose energies are farther out of balance, as a share of what ends a run, is ill already.
 HEALTHY = 0.2
 #: What a run is asked at a look: nothing, to keep a checkpoint, to keep one and end.
@@ -79,6 +80,7 @@ class Run:
         self.made: dict[str, Any] | None = None
         self.loaded: NDArray[np.float64] | None = None
         self.saved: deque[Memory] = deque(maxlen=2)  # to go back to the older of them; the younger may be ill already
+        self.start: Memory = {}  # the first of them
         self.first_step, self.next_checkpoint = 0, math.inf
         # The displacements that were good at the last look, their frame's time, and what was seen of them.
         self.good, self.good_time, self.good_figures = np.zeros((3, sub.n_nodes)), 0.0, self.watch.figures
@@ -170,7 +172,7 @@ class Run:
             self._take(forces)
             self.found, ahead = None, True  # it has been looked at where it goes on
         else:
-            self.looks = 0
+            self.looks, self.start = 0, {}
             self.saved.clear()
             self._take((*forces, *reactions))
             ahead = self._ahead(writer)
@@ -200,12 +202,15 @@ class Run:
                     self._write_last_good(writer)
                     raise
                 self.recoveries += 1
+                anew = self.recoveries == ANEW and self.loaded is None
                 while len(self.saved) > 1:
                     self.saved.pop()
+                if anew and isinstance(method, Relaxation):
+                    self.saved[0] = self.start
                 recall(self._passing, self.saved[0])
                 writer.rewind(self.frames)
                 method.state.show()
-                method.harden()
+                method.harden(anew)
                 self._take(method.forces)
         due, last = method.decide(self.watch.figures)
         if due and self.loaded is None:
@@ -216,6 +221,7 @@ class Run:
         healthy = self.watch.figures["balance_error"] < HEALTHY * BALANCE_LIMIT
         if self.method.recovers and self.looks % SAVED == 0 and healthy:
             self.saved.append(remember(self._passing))
+            self.start = self.start or self.saved[0]
         self.looks += 1
         if self.watch.request:
             with self.phases("checkpoints"):
@@ -271,7 +277,7 @@ class Run:
         writer.sync()  # the frames that it counts on
         about = self.about | {"step": self.method.state.step, "share": self.method.progress, "frames": self.frames}
         about["seeks_distance"] = self.loaded is not None
-        states = [*self.saved, remember(self._passing)]
+        states = [*([self.start] if self.start else []), *self.saved, remember(self._passing)]
         checkpoint.save(self.directory, self.world, self.sub, about, self._lasting, self._passing, states)
         self._ask_again()
 
@@ -285,7 +291,9 @@ class Run:
         if found.told["seeks_distance"]:
             self.method = self._relaxation()
         *saved, present = checkpoint.load(found, self.sub, self._lasting, self._passing)
-        self.saved.extend(saved)
+        if saved:
+            self.start = saved[0]
+            self.saved.extend(saved[1:])
         recall(self._passing, present)
         self.method.state.show()
         self.good[:] = self.method.state.u[:, : self.sub.n_nodes]
