@@ -60,7 +60,7 @@ nodes = "z1"
 displacement = [6.0, 0.0, 0.0]
 [solver]
 method = "quasi-static"
-load_time = 2.0
+load_time = 0.2
 [output]
 frames = 1
 """
