@@ -26,8 +26,8 @@ def small(monkeypatch):
 
 def test_the_outcome_is_in_the_form_that_is_promised_and_can_be_compared(small, tmp_path, capfd, monkeypatch):
     ranks(2)  # skips where there is no mpirun
-    path, counted, count = tmp_path / "new.json", [], bench._operations
-    monkeypatch.setattr(bench, "_operations", lambda folder: counted.append(count(folder)) or counted[0])
+    path, counted, count = tmp_path / "new.json", [], bench.operations
+    monkeypatch.setattr(bench, "operations", lambda folder: counted.append(count(folder)) or counted[0])
     assert ended("bench", "--quick", "--ranks", "1,2", "--json", path) == 0
     table = capfd.readouterr().out
     made = json.loads(path.read_text())
@@ -54,7 +54,7 @@ def test_the_outcome_is_in_the_form_that_is_promised_and_can_be_compared(small, 
     (tmp_path / "old.json").write_text(json.dumps(old))
     # Of two scenes, and with the operations as they were counted before: these are of small models of their own.
     monkeypatch.setattr(bench, "SIZES", {"voxel": (8,), "distorted": (6,)})
-    monkeypatch.setattr(bench, "_operations", lambda folder: counted[0])
+    monkeypatch.setattr(bench, "operations", lambda folder: counted[0])
     assert ended("bench", "--quick", "--ranks", "1", "--compare", tmp_path / "old.json") == 1
     out = capfd.readouterr()
     assert out.out.count("slower") == 1
