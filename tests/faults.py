@@ -24,6 +24,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+from scenes import MIXED, pulled
 
 from mpitled import store
 from mpitled.errors import InputError
@@ -41,21 +42,7 @@ PHASES = {
 }  # fmt: skip
 GONE = 10  # s, in which all processes have to be gone
 TOLERANCE = 1e-8  # of the largest displacement, between numbers of ranks
-SCENE = """
-[block]
-size = [30.0, 24.0, 24.0]
-elements = [10, 8, 8]
-cloud = "core"
-[cloud]
-points_per_spacing = 1.4
-[material.brain]
-youngs_modulus = 3000.0
-poissons_ratio = 0.49
-[[fixed]]
-nodes = "x0"
-[[displaced]]
-nodes = "x1"
-displacement = [4.0, 0.0, 0.0]
+SCENE = f"""{MIXED}{pulled(4.0)}
 [solver]
 method = "quasi-static"
 load_time = 1.5

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import complaint, mpitled, ranks
+from conftest import complaint, ended, mpitled, ranks
 
-from mpitled import cli
 from mpitled.speed import bench, limits, omissions
 from mpitled.speed.flops import Counting, of_terms
 
@@ -25,15 +24,10 @@ def small(monkeypatch):
     monkeypatch.setattr(bench, "_BRAIN", Path("no such file"))
 
 
-def ended(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as end:
-        cli.main([str(argument) for argument in arguments])
-    return int(end.value.code or 0)
-
-
-def test_the_outcome_is_in_the_form_that_is_promised_and_can_be_compared(small, monkeypatch, tmp_path, capfd):
+def test_the_outcome_is_in_the_form_that_is_promised_and_can_be_compared(small, tmp_path, capfd, monkeypatch):
     ranks(2)  # skips where there is no mpirun
-    path = tmp_path / "new.json"
+    path, counted, count = tmp_path / "new.json", [], bench.operations
+    monkeypatch.setattr(bench, "operations", lambda folder: counted.append(count(folder)) or counted[0])
     assert ended("bench", "--quick", "--ranks", "1,2", "--json", path) == 0
     table = capfd.readouterr().out
     made = json.loads(path.read_text())
@@ -58,12 +52,14 @@ def test_the_outcome_is_in_the_form_that_is_promised_and_can_be_compared(small, 
     old = {**made, "cases": [{**made["cases"][0], RATE: 1e6 * made["cases"][0][RATE]}]}
     assert bench.comparison(made, made)[1] is False
     (tmp_path / "old.json").write_text(json.dumps(old))
-    monkeypatch.setattr(bench, "SIZES", {"voxel": (8,), "mixed": (11.0,)})
+    # Of two scenes, and with the operations as they were counted before: these are of small models of their own.
+    monkeypatch.setattr(bench, "SIZES", {"voxel": (8,), "distorted": (6,)})
+    monkeypatch.setattr(bench, "operations", lambda folder: counted[0])
     assert ended("bench", "--quick", "--ranks", "1", "--compare", tmp_path / "old.json") == 1
     out = capfd.readouterr()
     assert out.out.count("slower") == 1
     assert out.err.count("1 rank: voxel") == 2  # timed once more before it is said
-    assert out.err.count("1 rank: mixed") == 1
+    assert out.err.count("1 rank: distorted") == 1
 
 
 def test_operations_are_counted_as_by_hand(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import subprocess
@@ -11,23 +12,13 @@ from pathlib import Path
 
 import pytest
 from conftest import ENVIRONMENT, ROOT, ranks
+from scenes import block, pulled
 
 from mpitled.errors import InputError
 from mpitled.store import open_result
 
 SCRIPTS = ("slurm.sh", "pbs.sh")
-SCENE = """
-[block]
-size = [20.0, 20.0, 20.0]
-elements = [6, 6, 6]
-[material.brain]
-youngs_modulus = 3000.0
-poissons_ratio = 0.3
-[[fixed]]
-nodes = "x0"
-[[displaced]]
-nodes = "x1"
-displacement = [0.1, 0.0, 0.0]
+SCENE = f"""{block((20, 20, 20), (6, 6, 6))}{pulled(0.1)}
 [solver]
 method = "dynamic"
 load_time = 0.02
@@ -57,13 +48,27 @@ def cluster(folder: Path, script: str, **more: str) -> tuple[list[str], dict[str
     return words, {**ENVIRONMENT, **given, **more}
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """By script: the folder and the output of a job that came to its end, and the seconds that it took."""
+
+    @functools.cache
+    def run(script: str) -> tuple[Path, str, float]:
+        folder = tmp_path_factory.mktemp("job")
+        words, variables = cluster(folder, script)
+        begin = time.monotonic()
+        done = subprocess.run(words, env=variables, capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return folder, done.stdout, time.monotonic() - begin
+
+    return run
+
+
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_a_job_builds_cuts_and_runs(tmp_path, script):
-    words, variables = cluster(tmp_path, script)
-    done = subprocess.run(words, env=variables, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "2 parts: balance" in done.stdout
-    with open_result(tmp_path / "out" / "scene") as result:
+def test_a_job_builds_cuts_and_runs(whole, script):
+    folder, printed, _ = whole(script)
+    assert "2 parts: balance" in printed
+    with open_result(folder / "out" / "scene") as result:
         assert result.complete
         assert result.metadata["ranks"] == 2
 

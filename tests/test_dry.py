@@ -8,6 +8,7 @@ import shutil
 
 import pytest
 from conftest import mpitled
+from scenes import block, pulled
 
 from mpitled.deck import load_deck
 from mpitled.errors import InputError
@@ -17,19 +18,10 @@ from mpitled.speed.dry import left_out, reasons
 from mpitled.speed.witness import kernel_names
 from mpitled.store import open_result
 
-SCENE = """
-[block]
-size = [20.0, 20.0, 20.0]
-elements = [8, 7, 7]
-cloud = "{cloud}"
-[material.brain]
-youngs_modulus = 3000.0
-poissons_ratio = 0.3
-[[fixed]]
-nodes = "x0"
-[[displaced]]
-nodes = "x1"
-displacement = [0.1, 0.0, 0.0]
+SCENE = (
+    block((20, 20, 20), (8, 7, 7), "{cloud}")
+    + pulled(0.1)
+    + """
 [support]
 nodes = 12
 [solver]
@@ -38,6 +30,7 @@ load_time = 0.1
 [output]
 frames = 1
 """
+)
 
 
 @pytest.mark.parametrize(("cloud", "ranks", "overrides"), [

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from conftest import ENVIRONMENT, ROOT, mpitled, ranks
+from scenes import block, pulled
 
 from mpitled.deck import load_deck
 from mpitled.errors import InputError
@@ -22,21 +23,7 @@ from mpitled.store import CHECKPOINTS, model_key, open_result
 SCRIPT = Path(__file__).with_name("two_hosts.sh")
 #: All that the launcher's keep-alive, TCP's tries and the end of the ranks take, s.
 SOON = 30
-SCENE = """
-[block]
-size = [20.0, 20.0, 20.0]
-elements = [8, 7, 7]
-cloud = "core"
-[support]
-nodes = 12
-[material.brain]
-youngs_modulus = 3000.0
-poissons_ratio = 0.45
-[[fixed]]
-nodes = "x0"
-[[displaced]]
-nodes = "x1"
-displacement = [1.0, 0.5, 0.0]
+SCENE = f"""{block((20, 20, 20), (8, 7, 7), "core")}{pulled(1.0)}
 [solver]
 method = "dynamic"
 load_time = 0.2

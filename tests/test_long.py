@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import ENVIRONMENT, ROOT, mpitled, ranks
+from scenes import block, pulled
 
 from mpitled.store import open_result
 
@@ -22,21 +23,12 @@ SWING, DRIFT = 1e-2, 1e-3
 #: Growth of a rank's memory over the second half of the run, bytes: none, but for a page here and there.
 GROWTH = 1 << 18
 #: Stretched in 20 steps, half of its slowest period, and left to itself: it swings to the end, for nothing damps it.
-SCENE = """
-[block]
-size = [20.0, 20.0, 20.0]
-elements = [5, 5, 5]
-cloud = "core"
+SCENE = (
+    block((20, 20, 20), (5, 5, 5), "core")
+    + pulled(1.0)
+    + """
 [support]
 nodes = 12
-[material.brain]
-youngs_modulus = 3000.0
-poissons_ratio = 0.3
-[[fixed]]
-nodes = "x0"
-[[displaced]]
-nodes = "x1"
-displacement = [1.0, 0.0, 0.0]
 [solver]
 method = "dynamic"
 load_time = {load}
@@ -46,6 +38,7 @@ time_step = {step}
 frames = {frames}
 pictures = false
 """
+)
 
 
 def memory(of: int) -> int:
@@ -61,10 +54,8 @@ def test_a_million_steps_on_two_ranks(tmp_path):
     deck.write_text(SCENE.format(load=20 * step, hold=end - 20 * step, step=step, frames=FRAMES))
     told = mpitled("run", deck, "--dry", "--out", out, n=2).stdout
     print(told[told.index("steps:") :])
-    # Ranks that wait give way: they may not have the machine for themselves.
-    environment = ENVIRONMENT | {"OMPI_MCA_mpi_yield_when_idle": "1"}
     command = [*ranks(2), "mpitled", "run", "-q", str(deck), "--out", str(out)]
-    job = subprocess.Popen(command, env=environment, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    job = subprocess.Popen(command, env=ENVIRONMENT, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     samples: dict[int, list[tuple[float, int]]] = {}
     begin = time.monotonic()
     while job.poll() is None:

@@ -32,8 +32,10 @@ cloud = "core"
 [tumour]
 centre = [24.0, 20.0, 20.0]
 volume = 90.0
+surface_nodes = 400
 [cloud]
 radius = 11.0
+growth = 0.35
 [material.brain]
 youngs_modulus = 3000.0
 poissons_ratio = 0.49

@@ -13,6 +13,7 @@ from conftest import ranks
 from faults import inject
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import MIXED, pulled
 
 from mpitled import checksum, cli, store
 from mpitled import deck as decks
@@ -22,24 +23,10 @@ from mpitled.solver import job
 from mpitled.solver.halo import World
 from mpitled.solver.run import Run
 
-BLOCK = """
-[block]
-size = [30.0, 24.0, 24.0]
-elements = [10, 8, 8]
-cloud = "core"
-[cloud]
-points_per_spacing = 1.4
-[material.brain]
-youngs_modulus = 3000.0
-poissons_ratio = 0.49
-[[fixed]]
-nodes = "x0"
-[[displaced]]
-nodes = "x1"
-displacement = [{millimetres}, 0.0, 0.0]
-rotation = {degrees}
-axis = "x"
-centre = [0.0, 12.0, 12.0]
+BLOCK = (
+    MIXED
+    + pulled("{millimetres}", rotation="{degrees}", axis='"x"', centre=[0.0, 12.0, 12.0])
+    + """
 [solver]
 load_time = 0.2
 {solver}
@@ -47,6 +34,7 @@ load_time = 0.2
 frames = 3
 pictures = false
 """
+)
 RAMP = 'method = "quasi-static"'
 #: What is not of the scene but of the machine, or of having been stopped.
 OF_THE_MACHINE = {"seconds", "term_seconds", "cell_updates_per_second", "halo_share", "imbalance", "peak_memory_bytes"}

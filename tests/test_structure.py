@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from conftest import ENVIRONMENT, ROOT
+from scenes import block, pulled
 
 from mpitled.deck import markdown_table
 
@@ -96,22 +97,10 @@ def test_the_command_starts_without_compilers_and_libraries():
     assert not modules & {"numpy", "scipy", "numba", "h5py", "mpi4py", "pymetis", "meshio", "matplotlib", "partition"}
 
 
-SCENE = """
-[block]
-size = [20.0, 20.0, 20.0]
-elements = [5, 5, 5]
-cloud = "core"
-[material.brain]
-youngs_modulus = 3000.0
-poissons_ratio = 0.3
-[[fixed]]
-nodes = "x0"
-[[displaced]]
-nodes = "x1"
-displacement = [0.1, 0.0, 0.0]
+SCENE = f"""{block((20, 20, 20), (5, 5, 5), "core")}{pulled(0.1)}
 [solver]
 method = "quasi-static"
-load_time = 1.0
+load_time = 0.1
 [output]
 frames = 1
 """

@@ -17,6 +17,7 @@ import h5py
 import numpy as np
 import pytest
 from conftest import ENVIRONMENT, ROOT, complaint, mpitled
+from scenes import TUMOUR
 
 from mpitled import open_sweep
 from mpitled.batch import cases, screen, summary, vary
@@ -203,23 +204,7 @@ def test_two_sweeps_do_not_work_in_one_folder(tmp_path):
     assert "another sweep is at work" in done.stderr
 
 
-GROWTH = """
-[block]
-size = [48.0, 40.0, 40.0]
-elements = [12, 10, 10]
-cloud = "core"
-[tumour]
-centre = [24.0, 20.0, 20.0]
-volume = 523.6
-surface_nodes = 400
-[cloud]
-radius = 11.0
-growth = 0.35
-[material.brain]
-youngs_modulus = 3000.0
-poissons_ratio = 0.49
-[[fixed]]
-nodes = "surface"
+GROWTH = f"""{TUMOUR}
 [solver]
 method = "quasi-static"
 load_time = 0.5
