@@ -85,8 +85,8 @@ def _print(figures: Any, table: Callable[[Any], str], options: argparse.Namespac
 
 def _mind_the_compiler() -> None:
     """A word before a silence: whoever calls the kernels for the first time waits for their compilation."""
-    cache = Path(__file__).parent / "solver" / "__pycache__"
-    if "NUMBA_CACHE_DIR" not in os.environ and not any(cache.glob("kernels.*.nbi")):
+    cache = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parent / "solver" / "kernels" / "__pycache__")
+    if not any(cache.glob("mpitled-*/**/*.nbi")):
         print("note: the kernels are compiled now, once; that takes some 15 s", file=sys.stderr, flush=True)
 
 

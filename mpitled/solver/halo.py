@@ -40,10 +40,19 @@ class World:
         self.rank: int = 0 if comm is None else comm.rank
         self.size: int = 1 if comm is None else comm.size
         self.comm: Any = comm if self.size > 1 else None
+        self._host: Any = None
 
     def split(self, size: int) -> World:
         """This rank's group, where so many ranks in turn make one."""
         return World(self.comm.Split(self.rank // size, self.rank))
+
+    def host(self) -> Any:
+        """The communicator of the ranks that share memory with this one. Collective."""
+        if self._host is None:
+            from mpi4py import MPI
+
+            self._host = self.comm.Split_type(MPI.COMM_TYPE_SHARED)
+        return self._host
 
     @property
     def leads(self) -> bool:
@@ -111,7 +120,7 @@ class Halo:
         self._all = np.unique(np.concatenate([nodes for _, nodes in shared])) if shared else np.zeros(0, np.uint32)
         self._total = np.empty((components, len(self._all)), precision)
         buffers = {rank: np.empty((4, components, len(nodes)), precision) for rank, nodes in shared}
-        close = _shared_buffers(world, buffers)
+        self._window, close = _shared_buffers(world, buffers)
         self._turns = []
         for turn in (0, 1):
             sends: list[_Part] = []
@@ -164,6 +173,15 @@ class Halo:
         self.start(values)
         self.finish(values)
 
+    def free(self) -> None:
+        """Give the memory back that is shared: a process may compute many runs. Collective; the halo's end."""
+        for *_, requests in self._turns:
+            for request in requests:
+                request.Free()
+        self._turns.clear()
+        if self._window is not None:
+            self._window.Free()
+
 
 _NOTHING = np.empty(0)
 #: Nodes, or their places among all that are shared, and a buffer for them.
@@ -171,16 +189,16 @@ _Part = tuple[NDArray[np.uint32], NDArray[np.floating]]
 _Pairs = tuple[tuple[NDArray[np.floating], NDArray[np.floating]], ...]
 
 
-def _shared_buffers(world: World, buffers: dict[int, NDArray[np.floating]]) -> dict[int, _Pairs]:
-    """By neighbour on this host, for each of two turns: the buffer that is written here, and the one that is read.
+def _shared_buffers(world: World, buffers: dict[int, NDArray[np.floating]]) -> tuple[Any, dict[int, _Pairs]]:
+    """Shared memory, and by neighbour on this host for each of two turns the buffers written and read here.
 
     buffers: as large as they have to be, by neighbour. Collective.
     """
     if world.comm is None:
-        return {}
+        return None, {}
     from mpi4py import MPI
 
-    host = world.comm.Split_type(MPI.COMM_TYPE_SHARED)
+    host = world.host()
     ranks = host.allgather(world.rank)
     begins: dict[int, list[int]] = {}
     end = 0
@@ -199,7 +217,8 @@ def _shared_buffers(world: World, buffers: dict[int, NDArray[np.floating]]) -> d
         return np.ndarray(like.shape, like.dtype, memory, of_all[writer][reader][turn])
 
     here = world.rank
-    return {rank: tuple((buffer(here, rank, turn), buffer(rank, here, turn)) for turn in (0, 1)) for rank in begins}
+    pairs = {rank: tuple((buffer(here, rank, turn), buffer(rank, here, turn)) for turn in (0, 1)) for rank in begins}
+    return window, pairs
 
 
 #: Buffers begin at pages: ranks that write do not share a line of a cache.

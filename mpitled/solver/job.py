@@ -11,7 +11,7 @@ import partition
 from mpitled import deck as decks
 from mpitled import store
 from mpitled.deck import Deck
-from mpitled.errors import InputError, everywhere
+from mpitled.errors import InputError, MpitledError, everywhere
 from mpitled.solver import checkpoint
 from mpitled.solver.halo import World
 from mpitled.solver.progress import Interrupts, Phases
@@ -79,7 +79,13 @@ def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False, resum
         if found == DONE:
             return _report(directory, world)
         run = prepare(deck, directory, world, quiet=quiet, found=found)
-        seconds = run.run(interrupts)
+        try:
+            seconds = run.run(interrupts)
+        except MpitledError as error:
+            if error.everywhere:
+                run.free()
+            raise
+        run.free()
         with run.phases("report"):
             return _report(directory, world, seconds)
 

@@ -61,6 +61,7 @@ class Run:
     ) -> None:
         """about: what tells the run from others; found: the checkpoint that it goes on from."""
         self.deck, self.directory, self.world, self.sub, self.phases = deck, directory, world, sub, phases
+        self.halos: list[Halo] = []
         self.force_halo = self._halo(3, sub.precision)
         solver, frames = deck.solver, deck.output.frames
         self.method: March | Relaxation
@@ -86,11 +87,19 @@ class Run:
         self.good, self.good_time, self.good_figures = np.zeros((3, sub.n_nodes)), 0.0, self.watch.figures
 
     def _halo(self, components: int, precision: type[np.floating] = np.float64) -> Halo | None:
-        return Halo(self.world, self.sub.shared, components, precision) if self.world.size > 1 else None
+        if self.world.size == 1:
+            return None
+        self.halos.append(Halo(self.world, self.sub.shared, components, precision))
+        return self.halos[-1]
 
     def _relaxation(self) -> Relaxation:
         deck, halo = self.deck, self._halo(6)
         return Relaxation(deck.solver, deck.output.frames, self.sub, self.world, self.force_halo, halo)
+
+    def free(self) -> None:
+        """Give back what ranks share. Collective; the run's end."""
+        for halo in self.halos:
+            halo.free()
 
     # ------------------------------------------------------------ the loop
 

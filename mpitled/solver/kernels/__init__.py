@@ -6,24 +6,48 @@ in SI units, and run in the precision of the arrays that they are given. Constan
 would be promoted.
 """
 
-from mpitled.solver.kernels.domains import domain_forces, domain_survey
-from mpitled.solver.kernels.hexahedra import hexahedron_forces, hexahedron_survey, voxel_forces, voxel_survey
-from mpitled.solver.kernels.lanes import BATCH as BATCH_LANES
-from mpitled.solver.kernels.nodes import (
-    add,
-    add_gathered,
-    change_step,
-    follow,
-    gather,
-    kinetic_energy,
-    raise_mass,
-    react,
-    relax,
-    renew_tensors,
-    scatter,
-    update,
-    watch_relaxation,
-)  # fmt: skip
+import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from numba.core import config
+
+
+@contextmanager
+def _cached_by_source() -> Iterator[None]:
+    """Cached apart for each state of this package: numba itself sees no change in a module that a kernel imports."""
+    settings: Any = config
+    digest, before, here = hashlib.sha256(), settings.CACHE_DIR, Path(__file__).parent
+    for path in sorted(here.glob("*.py")):
+        digest.update(path.read_bytes())
+    settings.CACHE_DIR = str(Path(before or here / "__pycache__") / f"mpitled-{digest.hexdigest()[:16]}")
+    try:
+        yield
+    finally:
+        settings.CACHE_DIR = before
+
+
+with _cached_by_source():
+    from mpitled.solver.kernels.domains import domain_forces, domain_survey
+    from mpitled.solver.kernels.hexahedra import hexahedron_forces, hexahedron_survey, voxel_forces, voxel_survey
+    from mpitled.solver.kernels.lanes import BATCH as BATCH_LANES
+    from mpitled.solver.kernels.nodes import (
+        add,
+        add_gathered,
+        change_step,
+        follow,
+        gather,
+        kinetic_energy,
+        raise_mass,
+        react,
+        relax,
+        renew_tensors,
+        scatter,
+        update,
+        watch_relaxation,
+    )  # fmt: skip
 
 PADDING = BATCH_LANES  # the last vector of a run reads beyond the run's nodes, and adds nothing there
 
