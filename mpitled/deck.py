@@ -108,7 +108,7 @@ class Cylinder:
     core_share: float = key('share of radius and height that `cloud = "core"` replaces', 0.5, limits="(0, 1)")
     grading: float = key(
         'thickness of the layers at both ends and of the outermost ring as a share of the mean; 1 with `cloud = "all"`',
-        0.3,
+        0.15,
         limits="(0, 1]",
     )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -262,3 +263,15 @@ def test_half_a_turn_runs_through(tmp_path):
     quarter = np.stack([-y - x, x - y, 0 * x], axis=1)
     assert np.abs(half.at_nodes[top] - quarter).max() < 1e-15
     assert np.abs(full.at_nodes[top] + 2 * places * [1, 1, 0]).max() < 1e-15
+
+
+def test_places_beyond_an_edge_or_a_corner_of_the_interface_are_in_the_cloud():
+    """Of a hexahedron with interface nodes on an edge: beyond it or its ends lies the cloud, beyond faces it does not.
+
+    A void has hexahedra that touch it with no face, and they may be the nearest of a place deep in the cloud.
+    """
+    model = SimpleNamespace(hexahedra=np.arange(8)[None], n_nodes=8, node_sets={"interface": [5, 6]})
+    ours = field.Field(model, np.zeros((8, 3)), np.zeros((8, 3)), 4, "quartic", 1.0, True, {})
+    xi = np.array([[3, 0, 3], [3, 4, 3], [3, -4, 3], [3, 0, 0], [0, 0, 3], [3, 4, 0], [0, 0, 0], [-3, 0, 3]], float)
+    across = ours._across_interface(np.zeros(len(xi), np.int64), xi)
+    np.testing.assert_array_equal(across, [True] * 3 + [False] * 5)

@@ -10,16 +10,20 @@ import pytest
 from conftest import ROOT
 from test_compare import CYLINDER, SLOPE, synthetic
 
-from mpitled.results import charts
+from mpitled.results import charts, field
+
+
+def load(name):
+    spec = importlib.util.spec_from_file_location(name, ROOT / "jobs" / "validation" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture(scope="module")
 def table():
-    spec = importlib.util.spec_from_file_location("table", ROOT / "jobs" / "validation" / "table.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["table"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
+    return load("table")
 
 
 def test_a_scene_in_the_table(table, tmp_path, monkeypatch, capsys):
@@ -51,6 +55,45 @@ def test_distortion_of_an_affine_field(table, tmp_path):
     gradient = np.eye(3) + SLOPE
     assert found["corner_J"] == pytest.approx(np.linalg.det(gradient), rel=1e-9)
     assert found["compression"] == pytest.approx(1 - np.linalg.svd(gradient, compute_uv=False).min(), rel=1e-9)
+
+
+def test_shares_of_a_radial_field(table, tmp_path):
+    """A field that is a tenth too large everywhere, at nodes and between."""
+    text = (ROOT / "jobs" / "validation" / "shell.toml").read_text()
+    text = text.replace("element_size = 5.0", "element_size = 12.0")
+    text = text.replace("[tumour]", "[cloud]\ngrowth = 0.5\n[tumour]\nsurface_nodes = 50")
+    ours = field.open_field(synthetic(tmp_path / "run", text, lambda places: 0.11 * places))
+    rho = np.linspace(0.002, 0.06, 30)
+    found = table.shares(ours, rho, 0.1 * rho)
+    assert {name.partition("_")[0] for name in found} == {"nodes", "places"}
+    assert list(found.values()) == pytest.approx([0.1] * len(found), rel=1e-6)
+
+
+@pytest.mark.study
+def test_the_expanded_shell_is_that_of_the_closed_form(table, tmp_path, monkeypatch):
+    """Within 2 % of the displacement everywhere but in the first ring around the seed."""
+    monkeypatch.setattr(table, "SHELLS", {"fine": table.SHELLS["fine"]})
+    (row,) = table.table_shell(tmp_path)
+    shares = {name: share for name, share in row.items() if name.startswith(("nodes_", "places_"))}
+    assert len(shares) == 2 * (len(table.SHELL_BANDS) - 1)
+    assert max(shares.values()) < 0.02
+
+
+@pytest.mark.parametrize("least", [0.3, 1.0, 5.0, 100.0])
+def test_the_shortest_ramp_is_found(tmp_path, monkeypatch, least):
+    """From runs that end near the static solution if their load takes so long (s); 100 s are more than are tried."""
+    relaxation = load("relaxation")
+
+    def solved(folder, deck, overrides):
+        return {"static_distance_mm": relaxation.NEAR * (least / float(folder.name.removeprefix("ramp-"))) ** 2}
+
+    monkeypatch.setattr(relaxation, "solved", solved)
+    load_time, ramp, shorter = relaxation.shortest_ramp(tmp_path, "cylinder", ())
+    if least < relaxation.LONGEST:
+        assert least <= load_time < relaxation.CLOSE * least
+        assert float(shorter.name.removeprefix("ramp-")) < least <= float(ramp.name.removeprefix("ramp-"))
+    else:
+        assert ramp is None
 
 
 def test_profiles_are_drawn(tmp_path):

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from mpitled import store
 from mpitled.errors import InputError, damaged
 from mpitled.mesh import CORNERS
-from mpitled.meshing.cloud import FACES, boundary_faces
+from mpitled.meshing.cloud import boundary_faces
 from mpitled.model import Model
 from mpitled.solver.support import moving_least_squares
 
@@ -72,17 +72,16 @@ class Field:
         return Values(displacement, source, np.where(fe, outside, 0.0))
 
     def _across_interface(self, cells: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Places (n,) that lie beyond a face of their hexahedron with nothing but interface nodes, or have none."""
+        """Places (n,) that lie beyond a face, an edge or a corner of their hexahedron, whichever is nearest, with
+        nothing but interface nodes; all of them where there are no hexahedra.
+        """
         if not len(self.model.hexahedra):
             return np.ones(len(cells), bool)
         interface = np.zeros(self.model.n_nodes, bool)
         interface[self.model.node_sets.get("interface", [])] = True
-        faces = interface[self.model.hexahedra[cells][:, FACES]].all(
-            axis=2
-        )  # t = -1, t = 1, s = -1, r = 1, s = 1, r = -1
-        r, s, t = xi.T
-        beyond = np.stack([t < -1, t > 1, s < -1, r > 1, s > 1, r < -1], axis=1)
-        return np.logical_and(faces, beyond).any(axis=1)
+        beyond = np.abs(xi) > 1
+        nearest = ((CORNERS * xi[:, None, :] > 0) | ~beyond[:, None, :]).all(axis=2)  # (n, 8)
+        return np.asarray(beyond.any(axis=1) & (interface[self.model.hexahedra[cells]] | ~nearest).all(axis=1))
 
 
 def open_field(path: Path, frame: int = -1) -> Field:
