@@ -21,16 +21,16 @@ def measure(ranks: Sequence[int], quick: bool) -> str:
     rows = []
     with tempfile.TemporaryDirectory(prefix="mpitled-bench-") as made:
         folder = Path(made)
-        operations = bench.operations(folder)
+        task = {"operations": bench.operations(folder), "quick": quick}
         strong = {kind: size if not quick else bench.SIZES[kind][0] for kind, size in STRONG.items()}
         edge = WEAK if not quick else bench.SIZES["voxel"][0]
         alone = {kind: bench.scene(folder / kind, kind, size) for kind, size in strong.items()}
         one = bench.scene(folder / "weak-1", "voxel", edge)
         for n in ranks:
             for kind, scene in alone.items():
-                rows.append(("strong", kind, n, *_compared(folder, operations, scene, scene, n)))
+                rows.append(("strong", kind, n, *_compared(folder, task, scene, scene, n)))
             many = bench.scene(folder / f"weak-{n}-ranks", "voxel", [n * edge, edge, edge])
-            rows.append(("weak", "voxel", n, *_compared(folder, operations, many, one, n)))
+            rows.append(("weak", "voxel", n, *_compared(folder, task, many, one, n)))
     head = ("scaling", "scene", "ranks", "cells", "M cells/s/core", "apart", "efficiency", "halo")
     lines = ["{:9}{:9}{:>6}{:>9}{:>16}{:>8}{:>12}{:>7}".format(*head)]
     for kind, name, n, cells, rate, apart, halo in rows:
@@ -39,12 +39,11 @@ def measure(ranks: Sequence[int], quick: bool) -> str:
 
 
 def _compared(
-    folder: Path, operations: dict[str, Any], together: dict[str, Any], apart: dict[str, Any], n: int
+    folder: Path, task: dict[str, Any], together: dict[str, Any], apart: dict[str, Any], n: int
 ) -> tuple[int, float, float, float]:
     """Cells of a scene, their rate on n ranks, that of n runs of one rank at once on another scene, and halo share."""
     if n > 1:
         job.divide(Path(together["model"]), n, 0)
-    task = {"operations": operations, "quick": False}
     (of_ranks,) = bench.timed(folder, task | {"scenes": [together]}, n)
     of_runs = bench.timed(folder, task | {"scenes": [apart]}, 1, copies=n)
     (made,) = (case for case in of_ranks["cases"] if case["precision"] == PRECISION)
