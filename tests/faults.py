@@ -45,7 +45,7 @@ TOLERANCE = 1e-8  # of the largest displacement, between numbers of ranks
 SCENE = f"""{MIXED}{pulled(4.0)}
 [solver]
 method = "quasi-static"
-load_time = 1.5
+load_time = 15.0
 [output]
 frames = 12
 pictures = false
