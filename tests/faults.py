@@ -45,7 +45,7 @@ TOLERANCE = 1e-8  # of the largest displacement, between numbers of ranks
 SCENE = f"""{MIXED}{pulled(4.0)}
 [solver]
 method = "quasi-static"
-load_time = 15.0
+load_time = 25.0
 [output]
 frames = 12
 pictures = false
@@ -356,7 +356,7 @@ class Faults:
                 assert job.reaches("checkpoints")
                 job.kill(0)
                 job.end(60)
-            _mount("remount,ro", disc)
+            _mount_when_free("remount,ro", disc)
             job = Job(disc / "out", 2)
             assert (status := job.end(60)) == 2, f"status {status}: {job.lines[-12:]}"
             assert "cannot be" in job.message, job.message
@@ -457,6 +457,18 @@ int gettimeofday(struct timeval *t, void *zone) {
 
 def _mount(options: str, folder: Path, *more: str) -> None:
     subprocess.run(["mount", *more, "-o", options, folder], check=True, capture_output=True)
+
+
+def _mount_when_free(options: str, folder: Path) -> None:
+    """As soon as what was killed has let go of its files: it is busy for as long."""
+    deadline = time.monotonic() + GONE
+    while True:
+        try:
+            return _mount(options, folder)
+        except subprocess.CalledProcessError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.1)
 
 
 @contextlib.contextmanager
