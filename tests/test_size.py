@@ -11,14 +11,10 @@ from pathlib import Path
 
 import pytest
 from conftest import ENVIRONMENT, ROOT
+from scenes import block
 
-BLOCK = """
-[block]
-size = [100.0, 100.0, 100.0]
-elements = [{n}, {n}, {n}]
-[material.brain]
-youngs_modulus = 3000.0
-poissons_ratio = 0.49
+#: A block pressed a little from above.
+PRESSED = """
 [[fixed]]
 nodes = "z0"
 [[displaced]]
@@ -53,7 +49,7 @@ def test_four_million_voxels(tmp_path):
     memory = {}
     for n in (100, 159):
         deck, out = tmp_path / f"{n}.toml", tmp_path / str(n)
-        deck.write_text(BLOCK.format(n=n))
+        deck.write_text(block((100, 100, 100), (n, n, n), nu=0.49) + PRESSED)
         built, cut = taken("build", deck, "--out", out), taken("partition", out, 2)
         print(f"{n**3} cells: built in {built[0]:.1f} s and {built[1] / 1e9:.2f} GB, cut in {cut[0]:.1f} s and "
               f"{cut[1] / 1e9:.2f} GB")  # fmt: skip
