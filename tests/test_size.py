@@ -22,8 +22,8 @@ nodes = "z1"
 directions = ["z"]
 displacement = [-1.0]
 """
-#: A few steps of the ramp, which keeps no states to go back to.
-SHORT = ("solver.method=quasi-static", "solver.load_time=0.02", "output.frames=1", "output.pictures=false")
+#: As few frames as can be.
+SHORT = ("output.frames=1", "output.pictures=false")
 
 
 def taken(*words: object) -> tuple[float, int]:
@@ -53,7 +53,7 @@ def test_four_million_voxels(tmp_path):
         built, cut = taken("build", deck, "--out", out), taken("partition", out, 2)
         print(f"{n**3} cells: built in {built[0]:.1f} s and {built[1] / 1e9:.2f} GB, cut in {cut[0]:.1f} s and "
               f"{cut[1] / 1e9:.2f} GB")  # fmt: skip
-        memory[n] = (*cells_and_memory(deck, out), built[1])
+        memory[n] = (*cells_and_memory(deck, out, "solver.method=dynamic", "solver.load_time=0.002"), built[1])
         print(f"{memory[n][0]} cells: {memory[n][1] / 1e6:.0f} MB in a run of one rank")
     assert built[0] + cut[0] < 180
     assert max(built[1], cut[1]) < 6 << 30
@@ -61,7 +61,11 @@ def test_four_million_voxels(tmp_path):
     run, build = ((memory[159][k] - memory[100][k]) / cells for k in (1, 2))
     print(f"by cell: {build:.0f} bytes to be built, {run:.0f} to be run")
     assert build < 1024
-    assert run < 150
+    # The step's arrays are 93 bytes a cell (`mpitled bench`); reading the part and the power iteration hold more.
+    assert run < 600
+
+
+METHOD = "solver.method=dynamic-relaxation"
 
 
 @pytest.mark.study
@@ -69,8 +73,8 @@ def test_the_brain_at_two_sizes(tmp_path):
     """Mixed: the share of support domains falls with the size of hexahedra, as it does in practice."""
     memory = []
     for size in (4.0, 2.0):
-        key = f"labels.element_size={size}"
-        memory.append(cells_and_memory(ROOT / "jobs" / "brain_tumour.toml", tmp_path / str(size), key))
+        key = f"labels.element_size={size}"  # relaxation, which keeps two states to go back to
+        memory.append(cells_and_memory(ROOT / "jobs" / "brain_tumour.toml", tmp_path / str(size), key, METHOD))
     (few, small), (many, large) = memory
     print(f"{few} to {many} cells: {(large - small) / (many - few):.0f} bytes a cell")
-    assert (large - small) / (many - few) < 450
+    assert (large - small) / (many - few) < 1000

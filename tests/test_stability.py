@@ -79,8 +79,8 @@ def test_every_outcome_is_told_and_nothing_runs_twice(tmp_path, monkeypatch, cap
 @pytest.mark.parametrize(("name", "value", "kind"), [("confined", "-20 %", "mixed"), ("stiff", "1e+06", "FE")])
 def test_slow_modes_that_come_to_light_late_are_waited_for(tmp_path, monkeypatch, name, value, kind):
     """Under ten shear moduli of pressure a cloud is soft, which shows after the quick modes have died; a core a million
-    times stiffer follows in ten thousand steps, in which first estimates come to nothing. The cloud is so near to giving
-    way that a last bit of its places decides it: then it says so.
+    times stiffer follows in ten thousand steps, in which first estimates come to nothing. The cloud is so near to
+    giving way that a last bit of its places decides it: then it says so.
     """
     axis = extremes.AXES[name]
     axis = dataclasses.replace(axis, values={value: axis.values[value]}, kinds=(kind,), methods=("relaxation",))
