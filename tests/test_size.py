@@ -77,4 +77,4 @@ def test_the_brain_at_two_sizes(tmp_path):
         memory.append(cells_and_memory(ROOT / "jobs" / "brain_tumour.toml", tmp_path / str(size), key, METHOD))
     (few, small), (many, large) = memory
     print(f"{few} to {many} cells: {(large - small) / (many - few):.0f} bytes a cell")
-    assert (large - small) / (many - few) < 1000
+    assert (large - small) / (many - few) < 450
