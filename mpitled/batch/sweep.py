@@ -137,9 +137,9 @@ def _prepare(case: Case) -> bool:
     """Make a case's folder ready; whether it goes on from the checkpoint that an interrupted run left in it."""
     if case.failure is None:
         try:
-            if checkpoint.find(case.folder, case.deck, store.model_key(case.folder / job.MODEL) or ""):
+            if checkpoint.find(case.folder, case.deck, decks.model_key(case.deck, job.included(case.deck))):
                 return True
-        except InputError:  # of another program, or damaged: begun anew
+        except InputError:  # of another program or model, or damaged: begun anew
             pass
     launch.prepare(case.folder, case.model / job.MODEL if case.shares else None)
     return False
