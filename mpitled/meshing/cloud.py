@@ -249,7 +249,8 @@ def volumes_and_centroids(cells: NDArray[np.float64]) -> tuple[NDArray[np.float6
     volumes, moments = np.zeros(len(cells)), np.zeros((len(cells), 3))
     for point in _GAUSS:
         slopes = [CORNERS[:, i] * np.delete(1 + CORNERS * point, i, axis=1).prod(axis=1) / 8 for i in range(3)]
-        weight = np.linalg.det(np.stack(slopes) @ cells)
+        r, s, t = (_weighted(slope, cells) for slope in slopes)
+        weight = (r * np.cross(s, t)).sum(axis=1)
         volumes += weight
         moments += weight[:, None] * _trilinear(cells, np.broadcast_to(point, (len(cells), 3)))
     return volumes, moments / volumes[:, None]
@@ -369,13 +370,24 @@ def _check_room(boundary: NDArray[np.float64], tumour: deck.Tumour, element_size
 
 def _trilinear(cells: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points (n, 3) of hexahedra (n, 8, 3) at places (n, 3) in [-1, 1]^3 (paper, eq. 4.4)."""
-    shape = (1 + CORNERS * places[:, None, :]).prod(axis=2) / 8
-    return (shape[:, None, :] @ cells)[:, 0]
+    return _weighted((1 + CORNERS * places[:, None, :]).prod(axis=2) / 8, cells)
+
+
+def _weighted(weights: NDArray[np.float64], cells: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sums (n, 3) of the corners of hexahedra (n, 8, 3) by weights (n, 8), or (8,) for all alike.
+
+    Corner by corner and not as a product of matrices, whose last bit a BLAS does not promise: it would decide where
+    nodes lie.
+    """
+    total = weights[..., 0, None] * cells[:, 0]
+    for corner in range(1, 8):
+        total += weights[..., corner, None] * cells[:, corner]
+    return np.asarray(total)
 
 
 def _edges(cells: NDArray[np.float64]) -> NDArray[np.float64]:
     """Lengths (n, 3) of hexahedra (n, 8, 3) along their three axes, through the centre."""
-    return np.linalg.norm(CORNERS.T @ cells / 4, axis=2)
+    return np.linalg.norm(np.stack([_weighted(axis, cells) for axis in CORNERS.T / 4], axis=1), axis=2)
 
 
 def _cuts(ratio: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.int64]:
@@ -404,7 +416,8 @@ def _outside(
     reach = np.linalg.norm(cells - middle[:, None], axis=2).max(axis=1)
     cut_cells = np.flatnonzero(spacing.distance(middle) < spacing.radius + reach)
     places = 2 * (np.indices((_SAMPLES,) * 3).reshape(3, -1).T + 0.5) / _SAMPLES - 1
-    samples = ((1 + CORNERS * places[:, None, :]).prod(axis=2) / 8) @ cells[cut_cells]
+    shapes = (1 + CORNERS * places[:, None, :]).prod(axis=2) / 8
+    samples = np.stack([_weighted(shape, cells[cut_cells]) for shape in shapes], axis=1)
     out = spacing.distance(samples.reshape(-1, 3)).reshape(len(cut_cells), -1) >= spacing.radius
     share = out.mean(axis=1)
     partial = (share > 0) & (share < 1)
@@ -412,7 +425,8 @@ def _outside(
     volumes, centroids = volumes.copy(), centroids.copy()
     volumes[cut_cells] *= share
     moved = cut_cells[partial]
-    centroids[moved] = (out[partial][:, None, :] @ samples[partial])[:, 0] / out[partial].sum(axis=1)[:, None]
+    inside = np.where(out[partial][:, :, None], samples[partial], 0.0).sum(axis=1)
+    centroids[moved] = inside / out[partial].sum(axis=1)[:, None]
 
     target = total.sum() - _ball(spacing.radius)
     sampled = volumes.sum()
