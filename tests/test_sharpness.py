@@ -111,7 +111,7 @@ def grows(method, mobility, ratio):
     """Whether a disturbance grows when every step is `ratio` times as long as the mobility has it."""
     n, s = method.sub.n_nodes, method.state
     start, free = s.u[:, :n].copy(), method.sub.free()
-    tensors = mobility if mobility.ndim == 2 else mobility * np.array([1.0, 0, 0, 1.0, 0, 1.0])[:, None]
+    tensors = mobility if len(mobility) == 6 else mobility * np.array([1.0, 0, 0, 1.0, 0, 1.0])[:, None]
 
     def force():
         s.f[:] = 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ from mpitled import deck as decks
 from mpitled.deck import Deck
 from mpitled.errors import InputError
 from mpitled.solver.halo import World
-from mpitled.solver.memory import Memory, Packed, Parts, pack, recall, remember, unpack
+from mpitled.solver.memory import Memory, Packed, Parts, pack, unpack
 from mpitled.solver.subdomain import Subdomain
 
 
@@ -75,33 +75,27 @@ def _other(told: dict[str, Any], deck: Deck, model_key: str) -> str:
 
 
 def save(
-    directory: Path,
-    world: World,
-    sub: Subdomain,
-    about: dict[str, Any],
-    lasting: Parts,
-    passing: Parts,
-    states: Sequence[Memory],
+    directory: Path, world: World, sub: Subdomain, about: dict[str, Any], memories: Mapping[str, tuple[Parts, Memory]]
 ) -> None:
-    """Write a checkpoint: what lasts, as it is now, and states, the last of them the present. Collective."""
-    packed = {"lasting": pack(lasting, remember(lasting), sub)}
-    packed |= {f"state{i}": pack(passing, state, sub) for i, state in enumerate(states)}
+    """Write a checkpoint of memories by name, each with the parts that it is of. Collective."""
+    packed = {name: pack(parts, memory, sub) for name, (parts, memory) in memories.items()}
     nodal = {f"{name}/{key}": values for name, of in packed.items() for key, values in of.nodal.items()}
     own = {f"{name}/{key}": value for name, of in packed.items() for key, value in of.own.items()}
     alike = {name: of.alike for name, of in packed.items()}
-    told = about | {"own": list(own), "states": len(states), "alike": alike}
+    told = about | {"own": list(own), "alike": alike}
     store.write_checkpoint(directory, world.comm, sub.rows, told, nodal, list(own.values()))
 
 
-def load(found: Found, sub: Subdomain, lasting: Parts, passing: Parts) -> list[Memory]:
-    """Put back what lasts; the states of a checkpoint, the last of them the present."""
+def load(found: Found, sub: Subdomain) -> Callable[[str, Parts], Memory | None]:
+    """What finds a memory of a checkpoint by its name and its parts; None if there is none of that name."""
     nodal, table = store.read_checkpoint(found.path, sub.rows.nodes)
     numbers = dict(zip(found.told["own"], table.T, strict=True))
 
-    def read(name: str, parts: Parts) -> Memory:
+    def read(name: str, parts: Parts) -> Memory | None:
+        if name not in found.told["alike"]:
+            return None
         of = {key.removeprefix(f"{name}/"): v for key, v in nodal.items() if key.startswith(f"{name}/")}
         own = {key.removeprefix(f"{name}/"): v for key, v in numbers.items() if key.startswith(f"{name}/")}
         return unpack(parts, Packed(of, {}, found.told["alike"][name]), own, sub)
 
-    recall(lasting, read("lasting", lasting))
-    return [read(f"state{i}", passing) for i in range(found.told["states"])]
+    return read

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from copy import copy, deepcopy
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from mpitled.solver import kernels
 from mpitled.solver.halo import Halo, World
 from mpitled.solver.memory import Kept
 from mpitled.solver.sharpness import Sharpness
-from mpitled.solver.step import at_rest, compose_forces, compose_march, rehearse
+from mpitled.solver.step import State, at_rest, compose_forces, compose_march, rehearse
 from mpitled.solver.subdomain import Subdomain
 from mpitled.solver.survey import Survey
 
@@ -38,6 +38,8 @@ class March:
     #: Beside the state: what an unstable run goes back to, and what stays as it is when it does.
     PASSING = Kept(sums=("added_mass", "added_energy"), alike=("frame",))
     LASTING = Kept(alike=("safety", "longest", "between"))
+    #: What it goes back to, of itself and of the state.
+    HEALTHY = (PASSING, State.KEPT)
 
     def __init__(
         self,
@@ -70,8 +72,11 @@ class March:
     def begin(self) -> None:
         """Find the step. Collective. InputError, alike on all ranks, for a step that is too long."""
         s, solver = self.state, self.solver
+        for _, term in self.forces:
+            term(s)
         self.survey.look(s, self.safety)
         required = self._required()
+        s.f[:] = 0
         if self.scales_mass:
             critical = self.typical / math.sqrt(self.sharpness.share)
         else:
@@ -117,11 +122,14 @@ class March:
         return self.state.time / self.end
 
     def warm_up(self) -> None:
-        """Call every kernel once, on the state at rest, without other ranks."""
+        """Call every kernel once, on the state at rest and to no effect, without other ranks."""
         twin = copy(self)
-        twin.state, twin.halo, twin.sharpness = deepcopy(self.state), None, self.sharpness.asleep()
+        # Its numbers are copies, its arrays are not: at millions of nodes they would be the largest that a run takes.
+        twin.state, twin.halo, twin.sharpness = copy(self.state), None, self.sharpness.asleep()
         rehearse(twin.state, (*self.forces, *self.motion))
         twin.look()
+        self.state.rest()
+        self.state.mass[:] = self.sub.rows.mass
 
     def look(self) -> dict[str, float]:
         """This rank's share of the figures at the present time, for which the forces are there.
@@ -154,7 +162,7 @@ class March:
         required[self.prescribed] = 0
         if self.sharpness.due():
             mass = required if self.scales_mass else s.mass
-            mobility = np.divide(1.0, mass, out=np.zeros_like(mass), where=mass > 0)
+            mobility = np.divide(1.0, mass, out=np.zeros_like(mass), where=mass > 0)[None]
             bound = (2 * self.safety / s.time_step) ** 2
             if not self.scales_mass:
                 bound *= self._largest((required / s.mass).max())

@@ -28,6 +28,11 @@ class Kept:
     alike: tuple[str, ...] = ()  # what JSON can hold, alike on all ranks
 
     @property
+    def numbers(self) -> Kept:
+        """The same, without arrays."""
+        return Kept(sums=self.sums, least=self.least, alike=self.alike)
+
+    @property
     def names(self) -> tuple[str, ...]:
         return (*self.nodes, *self.moving, *self.sums, *self.least, *self.alike)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from copy import copy, deepcopy
+from copy import copy
 from typing import Literal
 
 import numpy as np
@@ -52,6 +52,8 @@ class Relaxation:
         alike=("lowest", "distance", "frame", "settled", "best", "best_lowest", "waited"),
     )
     LASTING = Kept(alike=("safety", "between", "load_time"))
+    #: What it goes back to, of itself and of the state.
+    HEALTHY = (PASSING.numbers, State.KEPT_AT_REST)
 
     def __init__(
         self,
@@ -62,7 +64,7 @@ class Relaxation:
         force_halo: Halo | None,
         halo: Halo | None,
     ) -> None:
-        """halo sums six components."""
+        """halo sums `components`."""
         self.sub, self.halo, self.frames = sub, halo, frames
         self.safety = self.first_safety = solver.safety
         self.tolerance = solver.tolerance
@@ -71,17 +73,22 @@ class Relaxation:
         self.between = BETWEEN
         self.load_time = self._load_steps(solver.load_steps, world)
         self.state = at_rest(sub, self.load_time, 1.0)
-        self.state.mass = np.zeros((6, sub.n_nodes))
-        self.state.mobility = np.zeros((6, sub.n_nodes))
         self.survey = Survey(sub)
-        self.required = np.zeros((6, sub.n_nodes))
+        components = self.components(sub)
+        self.required = self.survey.required if components == 1 else np.zeros((components, sub.n_nodes))
+        self.state.mass, self.state.mobility = (np.zeros((components, sub.n_nodes)) for _ in range(2))
         self.free = sub.free()
-        self.counted: NDArray[np.float64] = self.free * sub.rows.owned  # free dofs that this rank owns
+        self.counted: NDArray[np.bool_] = self.free & sub.rows.owned  # free dofs that this rank owns
         self.u_then, self.f_then = np.zeros((3, sub.n_nodes)), np.zeros((3, sub.n_nodes))
         self.lowest, self.distance, self.frame, self.settled = 0.0, math.inf, 0, 0
         self.best, self.best_lowest, self.waited = math.inf, 0.0, 0
         self.forces, self.motion = compose_forces(sub, force_halo), compose_relaxation(sub, self.counted)
         self.sharpness = Sharpness(sub, world, self.forces, self.free)
+
+    @staticmethod
+    def components(sub: Subdomain) -> int:
+        """Numbers of a node's mass: a tensor's, if there is a support domain in the model, else one."""
+        return 6 if sub.rows.n_domains else 1
 
     def _load_steps(self, given: Literal["auto"] | int, world: World) -> float:
         """Steps in which the load grows. Collective.
@@ -106,7 +113,10 @@ class Relaxation:
 
     def begin(self) -> None:
         """Find how sharp the bound of stiffness is. Collective."""
+        for _, term in self.forces:
+            term(self.state)
         self._bound()
+        self.state.f[:] = 0
 
     @property
     def stalled(self) -> bool:
@@ -133,12 +143,15 @@ class Relaxation:
         return 0.5 + 0.5 * max(0.0, min(1.0, 1 - abs(done)))
 
     def warm_up(self) -> None:
-        """Call every kernel once, on the state at rest, without other ranks."""
+        """Call every kernel once, on the state at rest and to no effect, without other ranks."""
         twin = copy(self)
-        twin.state, twin.halo, twin.sharpness = deepcopy(self.state), None, self.sharpness.asleep()
-        twin.u_then, twin.f_then = self.u_then.copy(), self.f_then.copy()
+        # Its numbers are copies, its arrays are not: at millions of nodes they would be the largest that a run takes.
+        twin.state, twin.halo, twin.sharpness = copy(self.state), None, self.sharpness.asleep()
         rehearse(twin.state, (*self.forces, *self.motion))
         twin.look()
+        self.state.rest()
+        for array in (self.state.mass, self.state.mobility, self.u_then, self.f_then):
+            array[:] = 0
 
     def look(self) -> dict[str, float]:
         """As `March.look`; "dissipated" (J) is what damping and the change of masses took, by the work of the forces.
@@ -147,7 +160,7 @@ class Relaxation:
         """
         s = self.state
         found = self._bound()
-        kernels.renew_tensors(s.mass, self.required, s.mobility, self.free, KEEP)
+        kernels.renew_masses(s.mass, self.required, s.mobility, self.free, KEEP)
         kinetic, work, force, mass, change, residual = kernels.watch_relaxation(
             s.u, s.u_prev, s.f, s.mass, s.mobility, self.counted, self.u_then, self.f_then
         )
@@ -170,6 +183,8 @@ class Relaxation:
         anew: from where the load began, with masses and watch as at first.
         """
         self.state.place(self.state.u)
+        self.state.mass[:] = 0
+        self.u_then[:] = self.state.u[:, : self.sub.n_nodes]
         self.safety = self.first_safety if anew else self.safety / math.sqrt(2)
         self.between = BETWEEN if anew else max(1, self.between // 2)
         self.load_time *= 2
@@ -179,16 +194,19 @@ class Relaxation:
     def _bound(self) -> dict[str, float]:
         """Survey, and fill `required` with the masses that a stable step needs, on all ranks."""
         s = self.state
-        self.required[:] = 0
-        found = self.survey.look(s, self.safety, self.required)
-        for diagonal in (0, 3, 5):
-            self.required[diagonal] += self.survey.required[0]
+        if len(self.required) == 1:
+            found = self.survey.look(s, self.safety)
+        else:
+            self.required[:] = 0
+            found = self.survey.look(s, self.safety, self.required)
+            for diagonal in (0, 3, 5):
+                self.required[diagonal] += self.survey.required[0]
         if self.halo is not None:
             self.halo.sum(self.required)
         if self.sharpness.due() and (s.share < 1 or self.sharpness.share == 0):
-            mobility = np.empty_like(self.required)
-            kernels.renew_tensors(np.zeros_like(self.required), self.required, mobility, self.free, 0.0)
-            self.sharpness.renew(s, mobility, (2 * self.safety) ** 2)
+            # Where the looking goes on, masses and mobilities that last are made of what is found.
+            kernels.renew_masses(None, self.required, s.mobility, self.free, 0.0)
+            self.sharpness.renew(s, s.mobility, (2 * self.safety) ** 2)
         self.required *= self.sharpness.share
         return found
 

@@ -81,7 +81,7 @@ class Run:
         self.made: dict[str, Any] | None = None
         self.loaded: NDArray[np.float64] | None = None
         self.saved: deque[Memory] = deque(maxlen=2)  # to go back to the older of them; the younger may be ill already
-        self.start: Memory = {}  # the first of them
+        self.start: Memory = {}  # the numbers of the first, at no load
         self.first_step, self.next_checkpoint = 0, math.inf
         # The displacements that were good at the last look, their frame's time, and what was seen of them.
         self.good, self.good_time, self.good_figures = np.zeros((3, sub.n_nodes)), 0.0, self.watch.figures
@@ -93,7 +93,7 @@ class Run:
         return self.halos[-1]
 
     def _relaxation(self) -> Relaxation:
-        deck, halo = self.deck, self._halo(6)
+        deck, halo = self.deck, self._halo(Relaxation.components(self.sub))
         return Relaxation(deck.solver, deck.output.frames, self.sub, self.world, self.force_halo, halo)
 
     def free(self) -> None:
@@ -215,8 +215,12 @@ class Run:
                 while len(self.saved) > 1:
                     self.saved.pop()
                 if anew and isinstance(method, Relaxation):
-                    self.saved[0] = self.start
-                recall(self._passing, self.saved[0])
+                    method.state.rest()
+                    recall(self._numbers, self.start)
+                    self.saved.clear()
+                    self.saved.append(remember(self._healthy))
+                else:
+                    recall(self._healthy, self.saved[0])
                 writer.rewind(self.frames)
                 method.state.show()
                 method.harden(anew)
@@ -229,8 +233,8 @@ class Run:
             return False
         healthy = self.watch.figures["balance_error"] < HEALTHY * BALANCE_LIMIT
         if self.method.recovers and self.looks % SAVED == 0 and healthy:
-            self.saved.append(remember(self._passing))
-            self.start = self.start or self.saved[0]
+            self.saved.append(remember(self._healthy))
+            self.start = self.start or remember(self._numbers)
         self.looks += 1
         if self.watch.request:
             with self.phases("checkpoints"):
@@ -263,12 +267,22 @@ class Run:
 
     @property
     def _passing(self) -> Parts:
-        """What an unstable run goes back to."""
-        return (
-            ("method", self.method, self.method.PASSING),
-            ("state", self.method.state, State.KEPT),
-            ("output", self, self.PASSING),
+        """What changes from step to step."""
+        method = self.method
+        return (("method", method, method.PASSING), ("state", method.state, State.KEPT), ("output", self, self.PASSING))
+
+    @property
+    def _healthy(self) -> Parts:
+        """What of it an unstable run goes back to."""
+        return tuple(
+            (name, part, kept)
+            for (name, part, _), kept in zip(self._passing, (*self.method.HEALTHY, self.PASSING), strict=True)
         )
+
+    @property
+    def _numbers(self) -> Parts:
+        """What of that is no array."""
+        return tuple((name, part, kept.numbers) for name, part, kept in self._healthy)
 
     @property
     def _lasting(self) -> Parts:
@@ -286,8 +300,11 @@ class Run:
         writer.sync()  # the frames that it counts on
         about = self.about | {"step": self.method.state.step, "share": self.method.progress, "frames": self.frames}
         about["seeks_distance"] = self.loaded is not None
-        states = [*([self.start] if self.start else []), *self.saved, remember(self._passing)]
-        checkpoint.save(self.directory, self.world, self.sub, about, self._lasting, self._passing, states)
+        memories = {"lasting": (self._lasting, remember(self._lasting))}
+        memories |= {"start": (self._numbers, self.start)} if self.start else {}
+        memories |= {f"saved{i}": (self._healthy, memory) for i, memory in enumerate(self.saved)}
+        memories |= {"present": (self._passing, remember(self._passing))}
+        checkpoint.save(self.directory, self.world, self.sub, about, memories)
         self._ask_again()
 
     def _ask_again(self) -> None:
@@ -299,11 +316,12 @@ class Run:
         """Put back what a checkpoint holds."""
         if found.told["seeks_distance"]:
             self.method = self._relaxation()
-        *saved, present = checkpoint.load(found, self.sub, self._lasting, self._passing)
-        if saved:
-            self.start = saved[0]
-            self.saved.extend(saved[1:])
-        recall(self._passing, present)
+        read = checkpoint.load(found, self.sub)
+        recall(self._lasting, read("lasting", self._lasting) or {})
+        self.start = read("start", self._numbers) or {}
+        while (healthy := read(f"saved{len(self.saved)}", self._healthy)) is not None:
+            self.saved.append(healthy)
+        recall(self._passing, read("present", self._passing) or {})
         self.method.state.show()
         self.good[:] = self.method.state.u[:, : self.sub.n_nodes]
         self.first_step = self.method.state.step

@@ -13,6 +13,7 @@ from copy import copy
 import numpy as np
 from numpy.typing import NDArray
 
+from mpitled.solver import kernels
 from mpitled.solver.halo import World
 from mpitled.solver.memory import Kept
 from mpitled.solver.step import State, Term
@@ -34,19 +35,15 @@ class Sharpness:
 
     LASTING = Kept(nodes=("mode",), alike=("share", "wait"))
 
-    def __init__(self, sub: Subdomain, world: World, forces: tuple[Term, ...], free: NDArray[np.float64]) -> None:
-        """free (3, n_nodes) is 1 at free dofs and 0 at prescribed ones."""
+    def __init__(self, sub: Subdomain, world: World, forces: tuple[Term, ...], free: NDArray[np.bool_]) -> None:
+        """free (3, n_nodes): see `Subdomain.free`."""
         self._sub, self._world, self._forces, self._free = sub, world, forces, free
-        self._counted = free * sub.rows.owned
-        # Random numbers that belong to the nodes, whatever rank they are on.
-        numbers = 3.0 * sub.rows.nodes + np.arange(3)[:, None]
-        self._noise = (np.modf(np.abs(np.sin(12.9898 * (numbers + 1))) * 43758.5453)[0] - 0.5) * free
         self.mode: NDArray[np.float64] | None = None  # (3, n_nodes), the last eigenvector
         self.share = 0.0  # of the bound, that the operator has had at most
         self.wait = 0  # surveys until it is looked for again
         spread = float(np.ptp(sub.rows.points, axis=0).max()) if sub.n_nodes else 0.0
         # m, of the largest displacement that is tried: well above round-off, well below a cell.
-        self._reach = float(np.finfo(sub.precision).eps) ** 0.5 * 0.02 * float(world.gather([spread]).max())
+        self._reach = float(np.finfo(sub.precision).eps) ** 0.5 * 0.02 * self._largest(spread)
 
     def asleep(self) -> Sharpness:
         """A copy that asks nothing of other ranks at the next survey."""
@@ -68,47 +65,38 @@ class Sharpness:
     def largest_eigenvalue(self, s: State, mobility: NDArray[np.float64]) -> float:
         """Largest eigenvalue (1/s^2 times the mobility's dt^2) of `mobility` K at the displacements of s, from below.
 
-        mobility, s^2/kg: (n_nodes,), or symmetric tensors (6, n_nodes); 0 where it does not matter.
+        s has the forces of its displacements. mobility, s^2/kg: (1, n_nodes), or symmetric tensors (6, n_nodes); 0
+        where it does not matter.
         """
-        n, iterations = self._sub.n_nodes, FIRST if self.mode is None else AGAIN
+        n, rows, iterations = self._sub.n_nodes, self._sub.rows, FIRST if self.mode is None else AGAIN
         trial = copy(s)
-        trial.seen, trial.f = s.seen.copy(), np.zeros_like(s.f)
-        self._take(trial)
-        at_rest = trial.f[:, :n].astype(np.float64)
-        mode = self._noise.copy() if self.mode is None else self.mode + NOISE * self._noise
-        force, found = np.zeros_like(mode), 0.0
+        trial.seen, trial.f = s.seen.copy(), np.empty_like(s.f)
+        mode = self.mode = np.zeros((3, n)) if self.mode is None else self.mode
+        kernels.stir(mode, rows.nodes, self._free, NOISE if mode.any() else 1.0)
+        size, weight = self._largest(np.abs(mode).max(initial=0.0)), 0.0
+        found = 0.0
         for iteration in range(iterations):
-            size = float(self._world.gather([np.abs(mode).max(initial=0.0)]).max())
             if not 0 < size < math.inf:
                 return found
-            mode /= size
-            force /= size
-            trial.seen[:, :n] = s.u[:, :n] + self._reach * mode
+            kernels.perturb(s.u, mode, self._reach / size, trial.seen)
             trial.f[:] = 0
             self._take(trial)
-            response = (trial.f[:, :n] - at_rest) * (self._free / self._reach)
-            # The mode is mobility times the last response, so that their product is mode . M mode.
-            sums = self._world.gather([(self._counted * mode * g).sum() for g in (response, force)]).sum(axis=0)
-            last = found
-            if iteration > 0 and sums[1] > 0:
-                found = float(sums[0] / sums[1])
-            mode, force = _times(mobility, response), response
+            # The mode becomes mobility times its response, so that the response times it is mode . M mode.
+            sums = kernels.respond(mode, trial.f, s.f, mobility, self._free, rows.owned, self._reach, size)
+            table = self._world.gather(sums)
+            quotient, last = float(table[:, 0].sum()), found
+            if iteration > 0 and weight > 0:
+                found = quotient / weight
+            size = float(table[:, 2].max())
             if iteration > 2 and found < CONVERGED * last:
                 break
-        self.mode = mode / max(size * abs(found), 1e-300)
+            weight = float(table[:, 1].sum()) / size**2 if size > 0 else 0.0
+        mode /= max(size, 1e-300)
         return float(RUNG ** math.ceil(math.log(found) / math.log(RUNG))) if found > 0 else 0.0
+
+    def _largest(self, value: float) -> float:
+        return float(self._world.gather([value]).max())
 
     def _take(self, trial: State) -> None:
         for _, term in self._forces:
             term(trial)
-
-
-def _times(mobility: NDArray[np.float64], force: NDArray[np.float64]) -> NDArray[np.float64]:
-    if mobility.ndim == 1:
-        return mobility * force
-    m, (x, y, z) = mobility, force
-    return np.stack([
-        m[0] * x + m[1] * y + m[2] * z,
-        m[1] * x + m[3] * y + m[4] * z,
-        m[2] * x + m[4] * y + m[5] * z,
-    ])  # fmt: skip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -28,6 +28,8 @@ class State:
         least=("smallest_jacobian",),
         alike=("load_time", "time_step", "time", "step", "retain", "gain"),
     )
+    #: Of a state that is gone on from at rest, with masses made anew.
+    KEPT_AT_REST: ClassVar = replace(KEPT.numbers, nodes=("u",))
 
     u: NDArray[np.float64]  # (3, n_nodes + PADDING), m, at the time of `step`
     u_prev: NDArray[np.float64]  # (3, n_nodes + PADDING), m, one step before
@@ -50,6 +52,11 @@ class State:
         """Put the nodes at the displacements u (3, n_nodes), at rest."""
         self.u[:, : u.shape[1]] = self.u_prev[:, : u.shape[1]] = u
         self.show()
+
+    def rest(self) -> None:
+        """Back to no displacement."""
+        for array in (self.u, self.u_prev, self.seen, self.f, self.reaction):
+            array[:] = 0
 
     def show(self) -> None:
         """Let the cells see u after it was changed from outside, with no forces yet."""
@@ -181,7 +188,7 @@ def compose_march(sub: Subdomain) -> tuple[Term, ...]:
     return (*((("reactions", reactions),) if len(m.dofs) else ()), ("update", update))
 
 
-def compose_relaxation(sub: Subdomain, counted: NDArray[np.float64]) -> tuple[Term, ...]:
+def compose_relaxation(sub: Subdomain, counted: NDArray[np.bool_]) -> tuple[Term, ...]:
     """As `compose_march`, damped, and with a mass tensor at each node; counted (3, n_nodes): see `kernels.relax`."""
     m, (copied, advance) = _compose_motion(sub), _compose_copy(sub)
 

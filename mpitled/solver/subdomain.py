@@ -98,11 +98,11 @@ class Subdomain:
     shared: tuple[tuple[int, NDArray[np.uint32]], ...]  # (rank, nodes shared with it), ranks ascending
     precision: type[np.floating]  # of the cells' arithmetic
 
-    def free(self) -> NDArray[np.float64]:
-        """(3, n_nodes): 1 at free dofs, 0 at prescribed ones."""
-        free = np.ones((3, self.n_nodes))
+    def free(self) -> NDArray[np.bool_]:
+        """(3, n_nodes): whether a dof is free, and not prescribed."""
+        free = np.ones((3, self.n_nodes), bool)
         for held in (self.fixed, self.moving):
-            free[held % 3, held // 3] = 0
+            free[held % 3, held // 3] = False
         return free
 
     def steepest_load(self) -> float:

@@ -128,12 +128,13 @@ def reasons(deck: Deck, sub: Subdomain, ranks: int) -> dict[str, str]:
         "change_step": method if relaxes else "",
         "kinetic_energy": method,
         "raise_mass": heavier,
-        "renew_tensors": method,
+        "renew_masses": method,
         "watch_relaxation": method,
         "gather": alone,
         "add": alone,
         "add_gathered": alone,
         "scatter": alone,
+        **dict.fromkeys(("stir", "perturb", "respond"), ""),
     }
 
 

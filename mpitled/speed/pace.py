@@ -15,6 +15,7 @@ import numpy as np
 
 from mpitled import store
 from mpitled.solver.halo import Halo, World
+from mpitled.solver.relaxation import Relaxation
 from mpitled.solver.step import State, Term, at_rest, compose_forces, compose_march, compose_relaxation
 from mpitled.solver.subdomain import Subdomain, localise
 from mpitled.speed import limits
@@ -64,16 +65,16 @@ def made(sub: Subdomain, world: World, relaxed: bool = False) -> Pace:
     """The step of a part, marching or in relaxation, in a state that is strained by about 1 %."""
     state = at_rest(sub, 1.0, _TIME_STEP)
     if relaxed:
-        mobility = state.mobility
-        state.mobility = np.zeros((6, sub.n_nodes))
-        state.mobility[[0, 3, 5]] = mobility
+        mobility, components = state.mobility, Relaxation.components(sub)
+        state.mobility = np.zeros((components, sub.n_nodes))
+        state.mobility[[0] if components == 1 else [0, 3, 5]] = mobility
     x = sub.rows.points.T
     x = (x - x.mean(axis=1, keepdims=True)) / np.ptp(x)
     strained = _STRAIN * np.ptp(sub.rows.points) * (x[[1, 2, 0]] + np.sin(2 * np.pi * _WAVES * x) / (6 * _WAVES))
     state.place(strained)
     state.time = _SHARE * state.load_time
     halo = Halo(world, sub.shared, 3, sub.precision) if world.size > 1 else None
-    motion = compose_relaxation(sub, np.ones((3, sub.n_nodes))) if relaxed else compose_march(sub)
+    motion = compose_relaxation(sub, np.ones((3, sub.n_nodes), bool)) if relaxed else compose_march(sub)
     return Pace(sub, state, (*compose_forces(sub, halo), *motion), halo)
 
 

@@ -40,11 +40,14 @@ with _cached_by_source():
         follow,
         gather,
         kinetic_energy,
+        perturb,
         raise_mass,
         react,
         relax,
-        renew_tensors,
+        renew_masses,
+        respond,
         scatter,
+        stir,
         update,
         watch_relaxation,
     )  # fmt: skip
@@ -53,6 +56,6 @@ PADDING = BATCH_LANES  # the last vector of a run reads beyond the run's nodes, 
 
 __all__ = [
     "BATCH_LANES", "PADDING", "add", "add_gathered", "change_step", "domain_forces", "domain_survey", "follow",
-    "gather", "hexahedron_forces", "hexahedron_survey", "kinetic_energy", "raise_mass", "react", "relax",
-    "renew_tensors", "scatter", "update", "voxel_forces", "voxel_survey", "watch_relaxation",
+    "gather", "hexahedron_forces", "hexahedron_survey", "kinetic_energy", "perturb", "raise_mass", "react", "relax",
+    "renew_masses", "respond", "scatter", "stir", "update", "voxel_forces", "voxel_survey", "watch_relaxation",
 ]  # fmt: skip

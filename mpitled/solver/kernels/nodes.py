@@ -74,13 +74,26 @@ def update(u, u_prev, f, mobility, fixed, dofs, full, amplitude, copied):  # typ
     _prescribe(u_prev, fixed, dofs, full, amplitude, copied)
 
 
+@inline
+def times(tensor, n, x, y, z):  # type: ignore[no-untyped-def]
+    """The n-th of scalars (1, :), or of symmetric tensors (6, :: xx, xy, xz, yy, yz, zz), times a vector."""
+    if tensor.shape[0] == 1:
+        m = tensor[0, n]
+        return m * x, m * y, m * z
+    return (
+        tensor[0, n] * x + tensor[1, n] * y + tensor[2, n] * z,
+        tensor[1, n] * x + tensor[3, n] * y + tensor[4, n] * z,
+        tensor[2, n] * x + tensor[4, n] * y + tensor[5, n] * z,
+    )
+
+
 @kernel
 def relax(u, u_prev, f, mobility, counted, fixed, dofs, full, amplitude, retain, gain, copied):  # type: ignore[no-untyped-def]
-    """As `update`, with a mobility tensor at each node (6, n_nodes: xx, xy, xz, yy, yz, zz) and damping.
+    """As `update`, with damping, and with a mobility (1, n_nodes) or a tensor of it (6, n_nodes) at each node.
 
     u+ = u + retain (u - u_prev) - gain mobility f: with damping c per step, (2 - c) / (2 + c) and 2 / (2 + c).
-    Returns the work (J) of the internal forces where counted (3, n_nodes) is 1 and not 0, at free dofs that the rank
-    owns: each force times the mean of the steps before and after it.
+    Returns the work (J) of the internal forces where counted (3, n_nodes) is true, at free dofs that the rank owns:
+    each force times the mean of the steps before and after it.
     """
     half = 0.5
     work = 0.0
@@ -91,9 +104,10 @@ def relax(u, u_prev, f, mobility, counted, fixed, dofs, full, amplitude, retain,
         x = u[0, n] + retain * (u[0, n] - u_prev[0, n])
         y = u[1, n] + retain * (u[1, n] - u_prev[1, n])
         z = u[2, n] + retain * (u[2, n] - u_prev[2, n])
-        x -= gain * (mobility[0, n] * fx + mobility[1, n] * fy + mobility[2, n] * fz)
-        y -= gain * (mobility[1, n] * fx + mobility[3, n] * fy + mobility[4, n] * fz)
-        z -= gain * (mobility[2, n] * fx + mobility[4, n] * fy + mobility[5, n] * fz)
+        mx, my, mz = times(mobility, n, fx, fy, fz)
+        x -= gain * mx
+        y -= gain * my
+        z -= gain * mz
         work += half * (
             counted[0, n] * fx * (x - u_prev[0, n])
             + counted[1, n] * fy * (y - u_prev[1, n])
@@ -172,38 +186,48 @@ def raise_mass(u, u_prev, mass, mobility, required, counted, time_step):  # type
 
 
 @njit(cache=True)
-def renew_tensors(mass, required, mobility, free, keep):  # type: ignore[no-untyped-def]
-    """mass (6, n) <- required (6, n), mobility (6, n) <- its inverse, of free dofs alone; nothing at prescribed ones.
+def renew_masses(mass, required, mobility, free, keep):  # type: ignore[no-untyped-def]
+    """mass <- required, mobility <- its inverse, each (1, n), or (6, n): symmetric tensors of the free dofs alone.
 
-    free (3, n) is 1 at free dofs and 0 at prescribed ones. A mass that would fall below `keep` of what it was is scaled
-    up to that: cells that swing stiffen again before the next survey.
+    free (3, n) is true at free dofs; nothing is left at prescribed ones. A mass that would fall below `keep` of what it
+    was is scaled up to that: cells that swing stiffen again before the next survey. Without mass (None) none is.
     """
     for n in range(required.shape[1]):
-        x = free[0, n]
-        y = free[1, n]
-        z = free[2, n]
-        r = required[:, n]
-        xx = r[0] * x
-        xy = r[1] * x * y
-        xz = r[2] * x * z
-        yy = r[3] * y
-        yz = r[4] * y * z
-        zz = r[5] * z
-        trace = xx + yy + zz
-        least = keep * (mass[0, n] + mass[3, n] + mass[5, n])
-        s = least / trace if 0 < trace < least else 1.0
-        mass[0, n] = s * xx
-        mass[1, n] = s * xy
-        mass[2, n] = s * xz
-        mass[3, n] = s * yy
-        mass[4, n] = s * yz
-        mass[5, n] = s * zz
+        x = 1.0 if free[0, n] else 0.0
+        y = 1.0 if free[1, n] else 0.0
+        z = 1.0 if free[2, n] else 0.0
+        if required.shape[0] == 1:
+            r = required[0, n] * max(x, y, z)
+            if mass is not None:
+                r = max(r, keep * mass[0, n])
+                mass[0, n] = r
+            mobility[0, n] = 1 / r if r > 0 else 0.0
+            continue
+        xx = required[0, n] * x
+        xy = required[1, n] * x * y
+        xz = required[2, n] * x * z
+        yy = required[3, n] * y
+        yz = required[4, n] * y * z
+        zz = required[5, n] * z
+        if mass is not None:
+            trace = xx + yy + zz
+            least = keep * (mass[0, n] + mass[3, n] + mass[5, n])
+            s = least / trace if 0 < trace < least else 1.0
+            xx *= s
+            xy *= s
+            xz *= s
+            yy *= s
+            yz *= s
+            zz *= s
+            mass[0, n] = xx
+            mass[1, n] = xy
+            mass[2, n] = xz
+            mass[3, n] = yy
+            mass[4, n] = yz
+            mass[5, n] = zz
         # Prescribed dofs take part in the inverse as ones.
-        xx = mass[0, n] + 1 - x
-        yy = mass[3, n] + 1 - y
-        zz = mass[5, n] + 1 - z
         k0, k1, k2, _, k4, k5, _, _, k8, determinant = cofactor(
-            xx, mass[1, n], mass[2, n], mass[1, n], yy, mass[4, n], mass[2, n], mass[4, n], zz
+            xx + 1 - x, xy, xz, xy, yy + 1 - y, yz, xz, yz, zz + 1 - z
         )
         mobility[0, n] = x * k0 / determinant
         mobility[1, n] = x * y * k1 / determinant
@@ -215,7 +239,7 @@ def renew_tensors(mass, required, mobility, free, keep):  # type: ignore[no-unty
 
 @njit(cache=True)
 def watch_relaxation(u, u_prev, f, mass, mobility, counted, u_then, f_then):  # type: ignore[no-untyped-def]
-    """What relaxation has to know, of dofs where counted (3, n) is 1; renews u_then and f_then (3, n).
+    """What relaxation has to know, of dofs where counted (3, n) is true; renews u_then and f_then (3, n).
 
     Kinetic energy; the forces' work in the half step to the present (`relax` counts it with the next step); numerator
     and denominator of Rayleigh's quotient of the change since then, du . df / du . M du; the largest change in the last
@@ -231,7 +255,6 @@ def watch_relaxation(u, u_prev, f, mass, mobility, counted, u_then, f_then):  # 
         x = counted[0, n]
         y = counted[1, n]
         z = counted[2, n]
-        m = mass[:, n]
         vx = x * (u[0, n] - u_prev[0, n])
         vy = y * (u[1, n] - u_prev[1, n])
         vz = z * (u[2, n] - u_prev[2, n])
@@ -241,21 +264,14 @@ def watch_relaxation(u, u_prev, f, mass, mobility, counted, u_then, f_then):  # 
         fx = x * f[0, n]
         fy = y * f[1, n]
         fz = z * f[2, n]
-        kinetic += 0.5 * (
-            m[0] * vx * vx + m[3] * vy * vy + m[5] * vz * vz
-            + 2 * (m[1] * vx * vy + m[2] * vx * vz + m[4] * vy * vz)
-        )  # fmt: skip
+        mx, my, mz = times(mass, n, vx, vy, vz)
+        kinetic += 0.5 * (mx * vx + my * vy + mz * vz)
         work += 0.5 * (fx * vx + fy * vy + fz * vz)
         numerator += dx * (fx - f_then[0, n]) + dy * (fy - f_then[1, n]) + dz * (fz - f_then[2, n])
-        denominator += (
-            m[0] * dx * dx + m[3] * dy * dy + m[5] * dz * dz
-            + 2 * (m[1] * dx * dy + m[2] * dx * dz + m[4] * dy * dz)
-        )  # fmt: skip
+        mx, my, mz = times(mass, n, dx, dy, dz)
+        denominator += mx * dx + my * dy + mz * dz
         change = max(change, vx * vx + vy * vy + vz * vz)
-        m = mobility[:, n]
-        ax = m[0] * fx + m[1] * fy + m[2] * fz
-        ay = m[1] * fx + m[3] * fy + m[4] * fz
-        az = m[2] * fx + m[4] * fy + m[5] * fz
+        ax, ay, az = times(mobility, n, fx, fy, fz)
         residual = max(residual, ax * ax + ay * ay + az * az)
         u_then[0, n] = u[0, n]
         u_then[1, n] = u[1, n]
@@ -296,3 +312,53 @@ def scatter(some, nodes, values):  # type: ignore[no-untyped-def]
     for c in range(values.shape[0]):
         for i in range(U(nodes.size)):
             values[c, nodes[i]] = some[c, i]
+
+
+@njit(cache=True)
+def stir(mode, nodes, free, share):  # type: ignore[no-untyped-def]
+    """mode (3, n) += share times noise in [-0.5, 0.5) at free dofs, which belongs to the nodes' global numbers (n,).
+
+    The noise is a hash of the dof's number (the end of splitmix64; Steele, Lea and Flood 2014): it takes no memory.
+    """
+    for c in range(3):
+        for n in range(mode.shape[1]):
+            if free[c, n]:
+                x = np.uint64(3) * np.uint64(nodes[n]) + np.uint64(c) + np.uint64(0x9E3779B97F4A7C15)
+                x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+                x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+                x ^= x >> np.uint64(31)
+                mode[c, n] += share * (np.float64(x >> np.uint64(11)) * 2.0**-53 - 0.5)
+
+
+@kernel
+def perturb(u, mode, scale, seen):  # type: ignore[no-untyped-def]
+    """seen (3, :) <- u + scale mode, at the nodes of mode (3, n)."""
+    for c in range(3):
+        for n in range(U(mode.shape[1])):
+            seen[c, n] = u[c, n] + scale * mode[c, n]
+
+
+@kernel
+def respond(mode, f, at_rest, mobility, free, owned, reach, size):  # type: ignore[no-untyped-def]
+    """A power iteration: the mode (3, n), of which reach / size was tried, becomes mobility times its response K mode.
+
+    f, at_rest (3, :), N, with and without what was tried. Returns, of free dofs that are owned, the sums of response
+    times mode over size and of response times the new mode; and the largest component of the new mode.
+    """
+    old = 0.0
+    new = 0.0
+    largest = 0.0
+    per = 1 / reach
+    for n in range(U(mode.shape[1])):
+        x = per * free[0, n] * (f[0, n] - at_rest[0, n])
+        y = per * free[1, n] * (f[1, n] - at_rest[1, n])
+        z = per * free[2, n] * (f[2, n] - at_rest[2, n])
+        a, b, c = times(mobility, n, x, y, z)
+        if owned[n]:
+            old += mode[0, n] * x + mode[1, n] * y + mode[2, n] * z
+            new += a * x + b * y + c * z
+        largest = max(largest, max(abs(a), max(abs(b), abs(c))))
+        mode[0, n] = a
+        mode[1, n] = b
+        mode[2, n] = c
+    return old / size, new, largest
