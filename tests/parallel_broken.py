@@ -29,7 +29,7 @@ def not_a_number(run: Run, node: int) -> None:
 
 def inverted_cell(run: Run, node: int) -> None:
     """A node on the other side of its cells."""
-    run.method.state.u[0, node] += np.ptp(run.sub.rows.points[:, 0])
+    run.method.state.u[0, node] += np.ptp(run.sub.rows.read("points")[:, 0])
 
 
 def main(deck: str, directory: Path, way: str) -> None:

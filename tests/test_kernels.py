@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,6 +26,17 @@ MODES = np.stack([R * S, S * T, R * T, R * S * T], axis=1)
 def part(points, cells, domains, gradients, volumes, material, prescribed=((), ())):
     """A whole model as the only part, in the order of its own numbers."""
     n, n_domains = len(points), len(domains)
+    columns = {
+        "cells": np.arange(len(cells) + n_domains),
+        "material": np.asarray(material, np.int16),
+        "points": points,
+        "mass": np.ones(n),
+        "hexahedra": cells,
+        "domains": domains,
+        "domain_volumes": volumes,
+        "domain_gradients": gradients,
+        "domain_shapes": np.full(domains.shape, 1 / 8),
+    }
     nothing = np.zeros(0, np.int64)
     return PartRows(
         n_parts=1,
@@ -35,21 +45,11 @@ def part(points, cells, domains, gradients, volumes, material, prescribed=((), (
         n_fe_nodes=n if not n_domains else len(np.unique(cells)),
         n_hexahedra=len(cells),
         n_domains=n_domains,
-        cells=np.arange(len(cells) + n_domains),
+        n_own_hexahedra=len(cells),
+        n_own_domains=n_domains,
         nodes=np.arange(n),
-        node_ids=np.arange(n),
-        rows=np.arange(n),
         owned=np.ones(n, bool),
         first_row=0,
-        points=points,
-        mass=np.ones(n),
-        hexahedra=cells,
-        domains=domains,
-        domain_points=points[domains].mean(axis=1),
-        domain_volumes=volumes,
-        domain_gradients=gradients,
-        domain_shapes=np.full(domains.shape, 1 / 8),
-        material=np.asarray(material, np.int16),
         materials=(BRAIN, SOFT),
         prescribed_dofs=np.asarray(prescribed[0], np.int64),
         prescribed_displacements=np.asarray(prescribed[1], float),
@@ -60,6 +60,7 @@ def part(points, cells, domains, gradients, volumes, material, prescribed=((), (
         neighbours=nothing.astype(np.int32),
         shared=nothing,
         shared_offsets=np.zeros(1, np.int64),
+        source=lambda name, first, last: columns[name][first:last],
     )
 
 
@@ -90,24 +91,24 @@ def plain(sub_rows, u, stabilisation, rule="mean"):
     strain = resisted = 0.0
     J = []
     rows = sub_rows
-    lam = np.array([m.lam for m in rows.materials])[rows.material]
-    mu = np.array([m.mu for m in rows.materials])[rows.material]
-    n = len(rows.hexahedra)
+    lam = np.array([m.lam for m in rows.materials])[rows.read("material")]
+    mu = np.array([m.mu for m in rows.materials])[rows.read("material")]
+    n = rows.n_own_hexahedra
     kinds = []
     if n:
-        B, V = hexahedra.geometry(rows.points, rows.hexahedra, rule)
-        x = rows.points[rows.hexahedra]
+        B, V = hexahedra.geometry(rows.read("points"), rows.read("hexahedra"), rule)
+        x = rows.read("points")[rows.read("hexahedra")]
         gamma = MODES - np.einsum("eai,ebi,bm->eam", B, x, MODES)
         k = HOURGLASS * (lam[:n] + 2 * mu[:n]) * V * (B**2).sum((1, 2)) / 8
-        kinds.append((rows.hexahedra, B, V, k, np.einsum("eam,ebm->eab", gamma, gamma), slice(0, n)))
-    if len(rows.domains):
-        B, V = rows.domain_gradients, rows.domain_volumes
-        x = rows.points[rows.domains]
+        kinds.append((rows.read("hexahedra"), B, V, k, np.einsum("eam,ebm->eab", gamma, gamma), slice(0, n)))
+    if rows.n_own_domains:
+        B, V = rows.read("domain_gradients"), rows.read("domain_volumes")
+        x = rows.read("points")[rows.read("domains")]
         P = np.concatenate([np.ones((*x.shape[:2], 1)), x - x.mean(1, keepdims=True)], axis=2)
         Q = np.eye(x.shape[1]) - P @ np.linalg.inv(np.swapaxes(P, 1, 2) @ P) @ np.swapaxes(P, 1, 2)
         linear = (x - x.mean(1, keepdims=True)) @ np.linalg.inv(np.einsum("gai,gaj->gij", P[..., 1:], P[..., 1:]))
         k = stabilisation * (lam[n:] + 2 * mu[n:]) * V * (linear**2).sum((1, 2)) / 8
-        kinds.append((rows.domains, B, V, k, Q, slice(n, None)))
+        kinds.append((rows.read("domains"), B, V, k, Q, slice(n, None)))
     for nodes, B, V, k, Q, these in kinds:
         X = np.eye(3) + np.einsum("eai,eaj->eij", u[nodes], B)
         P = np.stack([first_piola(x, a, b) for x, a, b in zip(X, lam[these], mu[these], strict=True)])
@@ -170,7 +171,7 @@ def test_forces_energies_and_jacobians_are_those_of_the_plain_formulas(scene, st
     sub = localise(rows, HOURGLASS, stabilisation, rule)
     assert (sub.runs is not None) == ("voxels" in scene)
     assert (sub.hexahedra is not None) == ("distorted" in scene)
-    u = np.random.default_rng(1).normal(size=rows.points.shape) * 1e-4
+    u = np.random.default_rng(1).normal(size=rows.read("points").shape) * 1e-4
     expected, strain, resisted, J = plain(rows, u, stabilisation, rule)
     state = at(sub, u)
     found = forces(sub, state).copy()
@@ -202,11 +203,11 @@ def test_nodes_behind_a_run_are_no_cell():
 @pytest.mark.parametrize("scene", SCENES)
 def test_cells_cost_by_what_computes_them(scene):
     rows = SCENES[scene]()
-    sub = localise(replace(rows, material=0 * rows.material), HOURGLASS, 0.1, "mean")
-    costs = cell_costs(rows.points, rows.hexahedra, rows.domains)
+    sub = localise(rows.holding(material=0 * rows.read("material")), HOURGLASS, 0.1, "mean")
+    costs = cell_costs(rows.read("points"), rows.read("hexahedra"), rows.read("domains"))
     in_runs = int(sub.runs.length.sum()) if sub.runs else 0
-    of_domain = DOMAIN_NODE_COST * rows.domains.shape[1]
-    expected = [1.0] * in_runs + [GATHERED_COST] * (len(rows.hexahedra) - in_runs) + [of_domain] * len(rows.domains)
+    of_domain = DOMAIN_NODE_COST * rows.read("domains").shape[1]
+    expected = [1.0] * in_runs + [GATHERED_COST] * (rows.n_own_hexahedra - in_runs) + [of_domain] * rows.n_own_domains
     assert sorted(costs) == sorted(expected)
 
 
@@ -215,7 +216,7 @@ def test_forces_are_the_gradient_of_the_energies(scene):
     rows = SCENES[scene]()
     sub = localise(rows, HOURGLASS, 0.1, "mean")
     rng = np.random.default_rng(2)
-    u, direction = rng.normal(size=(2, *rows.points.shape)) * 1e-4
+    u, direction = rng.normal(size=(2, *rows.read("points").shape)) * 1e-4
 
     def energy(step):
         figures = Survey(sub).look(at(sub, u + step * direction), 1.0)
@@ -234,16 +235,16 @@ def test_no_force_from_rigid_motion_and_no_moment_from_any(scene):
     rng = np.random.default_rng(4)
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     turn *= np.sign(np.linalg.det(turn))
-    rigid = rows.points @ turn.T - rows.points + [1e-3, 2e-3, -3e-3]
-    wild = rng.normal(size=rows.points.shape) * 1e-4
+    rigid = rows.read("points") @ turn.T - rows.read("points") + [1e-3, 2e-3, -3e-3]
+    wild = rng.normal(size=rows.read("points").shape) * 1e-4
     f = forces(sub, at(sub, wild)).copy()
     scale = np.abs(f).sum()
     assert np.abs(forces(sub, at(sub, rigid))).max() < 1e-12 * scale
     assert np.abs(f.sum(axis=0)).max() < 1e-14 * scale
-    reach = np.abs(rows.points).max()
+    reach = np.abs(rows.read("points")).max()
     # Hourglass and stabilising forces act along the reference frame, not the turned one: they keep the moment about
     # reference places, while stress keeps that about present ones.
-    moment = np.cross(rows.points + wild, f).sum(axis=0)
+    moment = np.cross(rows.read("points") + wild, f).sum(axis=0)
     modes = np.cross(wild, f - plain_stress(rows, wild)).sum(axis=0)
     assert np.abs(moment - modes).max() < 1e-13 * scale * reach
 
@@ -279,17 +280,22 @@ def test_the_bound_holds_the_true_stiffness(scene, stretch):
     M - dt^2 / 4 K must be positive semidefinite: by central differences of the forces, a dense tangent.
     """
     rows = SCENES[scene]()
-    keep = slice(0, 24) if len(rows.hexahedra) else slice(0, 16)
-    if len(rows.hexahedra):
-        used = np.unique(rows.hexahedra[keep])
-        rows = part(rows.points[used], np.searchsorted(used, rows.hexahedra[keep]), *no_domains(), rows.material[keep])
+    keep = slice(0, 24) if rows.n_own_hexahedra else slice(0, 16)
+    if rows.n_own_hexahedra:
+        used = np.unique(rows.read("hexahedra")[keep])
+        rows = part(
+            rows.read("points")[used],
+            np.searchsorted(used, rows.read("hexahedra")[keep]),
+            *no_domains(),
+            rows.read("material")[keep],
+        )
     else:
         points, domains, gradients, volumes = cloud(n=24, n_domains=16)
         rows = part(points, np.zeros((0, 8), np.int64), domains, gradients, volumes, np.arange(16) % 2)
     sub = localise(rows, HOURGLASS, 0.1, "mean")
     rng = np.random.default_rng(5)
     deform = np.diag([1 + stretch, 1 / (1 + stretch), 1.02]) - np.eye(3)
-    u = rows.points @ deform + rng.normal(size=rows.points.shape) * 1e-5
+    u = rows.read("points") @ deform + rng.normal(size=rows.read("points").shape) * 1e-5
     n = u.size
     K = np.empty((n, n))
     h = 1e-7

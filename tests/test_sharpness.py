@@ -121,7 +121,7 @@ def grows(method, mobility, ratio):
 
     s.u[:, :n] = start
     at_start = force()
-    size = 1e-9 * np.ptp(method.sub.rows.points)
+    size = 1e-9 * np.ptp(method.sub.rows.read("points"))
     now = before = np.random.default_rng(0).uniform(-size, size, (3, n)) * free
     try:
         for _ in range(STEPS):
@@ -158,7 +158,7 @@ def test_auto_is_never_above_the_limit_and_mostly_near_it(tmp_path):
     world, shares = World(), {}
     for name, text, share, stretch in scenes():
         deck, sub, figures = subdomain(tmp_path, text, share)
-        place = (sub.rows.points @ (STRETCHES[stretch] - np.eye(3)).T).T
+        place = (sub.rows.read("points") @ (STRETCHES[stretch] - np.eye(3)).T).T
         for kind in ("dynamic", "quasi-static", "relaxation"):
             solver = replace(deck.solver, method=kind)
             if kind == "relaxation":

@@ -358,7 +358,7 @@ def test_patch_of_the_mixed_mesh(tmp_path, support, cloud):
             model.points, model.hexahedra, model.domains, model.domain_gradients, model.domain_volumes, model.material
         )
         sub = localise(rows, HOURGLASS, 0.1, "mean")
-        f = forces(sub, at(sub, rows.points @ AFFINE.T))
+        f = forces(sub, at(sub, rows.read("points") @ AFFINE.T))
         inner = np.ones(model.n_nodes, bool)
         inner[model.node_sets["surface"]] = False
         return np.abs(f[inner]).max() / np.abs(f).max()

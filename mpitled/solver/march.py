@@ -129,7 +129,7 @@ class March:
         rehearse(twin.state, (*self.forces, *self.motion))
         twin.look()
         self.state.rest()
-        self.state.mass[:] = self.sub.rows.mass
+        self.state.mass[:] = self.sub.rows.read("mass")
 
     def look(self) -> dict[str, float]:
         """This rank's share of the figures at the present time, for which the forces are there.

@@ -160,7 +160,8 @@ class Relaxation:
         """
         s = self.state
         found = self._bound()
-        kernels.renew_masses(s.mass, self.required, s.mobility, self.free, KEEP)
+        kernels.keep_masses(s.mass, self.required, self.free, KEEP)
+        kernels.invert_masses(s.mass, self.free, s.mobility)
         kinetic, work, force, mass, change, residual = kernels.watch_relaxation(
             s.u, s.u_prev, s.f, s.mass, s.mobility, self.counted, self.u_then, self.f_then
         )
@@ -204,8 +205,8 @@ class Relaxation:
         if self.halo is not None:
             self.halo.sum(self.required)
         if self.sharpness.due() and (s.share < 1 or self.sharpness.share == 0):
-            # Where the looking goes on, masses and mobilities that last are made of what is found.
-            kernels.renew_masses(None, self.required, s.mobility, self.free, 0.0)
+            # Where the looking goes on, the mobility that lasts is made of what is found.
+            kernels.invert_masses(self.required, self.free, s.mobility)
             self.sharpness.renew(s, s.mobility, (2 * self.safety) ** 2)
         self.required *= self.sharpness.share
         return found

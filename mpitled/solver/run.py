@@ -382,11 +382,12 @@ class Run:
         }
 
     def _write(self, writer: store.ResultWriter, frame_time: float) -> None:
-        rows, u = self.sub.rows, self.method.state.u[:, : self.sub.n_nodes]
-        domains = np.searchsorted(rows.nodes, rows.domains)
-        at_points = np.einsum("ga,cga->gc", rows.domain_shapes, u[:, domains])
-        displacement = np.concatenate([u.T[rows.owned], at_points])
-        field = np.concatenate([self._field(u, domains)[rows.owned], at_points])
+        sub, u = self.sub, self.method.state.u[:, : self.sub.n_nodes]
+        at_points = np.einsum("ga,cga->gc", sub.domain_shapes, u[:, sub.domain_nodes])
+        displacement = field = self._owned(u)
+        if sub.rows.n_domains:
+            field = np.concatenate([self._owned(self._field(u)), at_points])
+            displacement = np.concatenate([displacement, at_points])
         series = {name: self.watch.figures[name] for name in _SERIES}
         self.frames, self.written = self.frames + 1, frame_time
         writer.write_frame(
@@ -396,18 +397,23 @@ class Run:
             series,
         )
 
-    def _field(self, u: NDArray[np.float64], domains: NDArray[np.int64]) -> NDArray[np.float64]:
-        """u_h (n_nodes, 3), m: the parameters of EFG nodes are not the field; one domain's MLS gives it there."""
+    def _owned(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values (n_owned, 3) of values (3, n_nodes)."""
+        owned = self.sub.rows.owned
+        return u.T if owned.all() else u.T[owned]
+
+    def _field(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """u_h (3, n_nodes), m: the parameters of EFG nodes are not the field; one domain's MLS gives it there."""
         rows = self.sub.rows
         field = np.where(rows.owned & (rows.nodes < rows.n_fe_nodes), u, 0.0)
-        first_domain = rows.cells[len(rows.hexahedra) :] - rows.n_hexahedra
-        giving = domains[np.searchsorted(first_domain, rows.field_domains)]
+        domains = rows.read("cells", rows.n_own_hexahedra) - rows.n_hexahedra
+        giving = self.sub.domain_nodes[np.searchsorted(domains, rows.field_domains)]
         field[:, np.searchsorted(rows.nodes, rows.field_nodes)] = np.einsum(
             "ga,cga->cg", rows.field_shapes, u[:, giving]
         )
         if self.force_halo is not None:
             self.force_halo.sum(field)
-        return field.T
+        return field
 
     def _run_figures(self, loop_seconds: float) -> dict[str, Any]:
         """What the report says of the run itself. Collective."""
@@ -418,8 +424,8 @@ class Run:
         )
         table = world.gather(
             [
-                len(rows.hexahedra),
-                len(rows.domains),
+                rows.n_own_hexahedra,
+                rows.n_own_domains,
                 halo_seconds / max(loop_seconds, 1e-9),
                 computing,
                 resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,

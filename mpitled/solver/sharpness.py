@@ -41,7 +41,7 @@ class Sharpness:
         self.mode: NDArray[np.float64] | None = None  # (3, n_nodes), the last eigenvector
         self.share = 0.0  # of the bound, that the operator has had at most
         self.wait = 0  # surveys until it is looked for again
-        spread = float(np.ptp(sub.rows.points, axis=0).max()) if sub.n_nodes else 0.0
+        spread = float(np.ptp(sub.rows.read("points"), axis=0).max()) if sub.n_nodes else 0.0
         # m, of the largest displacement that is tried: well above round-off, well below a cell.
         self._reach = float(np.finfo(sub.precision).eps) ** 0.5 * 0.02 * self._largest(spread)
 

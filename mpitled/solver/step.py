@@ -82,7 +82,7 @@ def at_rest(sub: Subdomain, load_time: float, time_step: float) -> State:
     u, u_prev = (np.zeros((3, sub.n_nodes + kernels.PADDING)) for _ in range(2))
     seen = u if sub.precision == u.dtype else u.astype(sub.precision)
     f = np.zeros_like(seen)
-    mass = sub.rows.mass.copy()
+    mass = sub.rows.read("mass").copy()  # columns in memory stay as they are
     owned_moving = int(np.count_nonzero(sub.rows.owned[sub.moving // 3]))
     return State(u, u_prev, seen, f, mass, time_step**2 / mass, np.zeros(owned_moving), load_time, time_step)
 

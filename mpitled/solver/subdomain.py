@@ -13,7 +13,7 @@ from mpitled.mesh import CORNERS
 from mpitled.solver import hexahedra, support
 from mpitled.solver.kernels import BATCH_LANES
 from mpitled.solver.kernels.lanes import BITS
-from mpitled.store import PartRows
+from mpitled.store import BLOCK, PartRows
 
 #: Boxes in a row shorter than this are gathered: a run keeps a whole vector of lanes busy.
 SHORTEST_RUN = 4
@@ -86,6 +86,8 @@ class Subdomain:
     """
 
     rows: PartRows
+    domain_nodes: NDArray[np.uint32]  # (n_domains, n)
+    domain_shapes: NDArray[np.float64]  # (n_domains, n), at their integration points
     n_nodes: int
     n_cells: int
     runs: VoxelRuns | None
@@ -111,6 +113,7 @@ class Subdomain:
         It is by how much of its own size a cell next to moving nodes would be strained, if nothing gave way.
         """
         rows, speed = self.rows, np.zeros((self.n_nodes, 3))
+        points = rows.read("points")
         velocity = self.moving_full
         if self.moving_turns is not None:
             angle, arm, across = self.moving_turns.T
@@ -118,17 +121,17 @@ class Subdomain:
         speed.reshape(-1)[self.moving] = velocity
         moves: NDArray[np.bool_] = np.any(speed, axis=1)
         steepest = 0.0
-        for nodes in (rows.hexahedra, rows.domains):
-            cells = np.searchsorted(rows.nodes, nodes)
-            near = moves[cells].any(axis=1)
-            if near.any():
-                gradients = (
-                    hexahedra.geometry(rows.points, cells[near])[0]
-                    if nodes is rows.hexahedra
-                    else rows.domain_gradients[near]
-                )
-                found = np.einsum("cai,caj->cij", speed[cells[near]], gradients)
-                steepest = max(steepest, float(np.sqrt((found**2).sum(axis=(1, 2)).max())))
+        for kind in ("hexahedra", "domains"):
+            for first, nodes in rows.blocks(kind):
+                cells = np.searchsorted(rows.nodes, nodes)
+                near = moves[cells].any(axis=1)
+                if near.any():
+                    if kind == "hexahedra":
+                        gradients = hexahedra.geometry(points, cells[near])[0]
+                    else:
+                        gradients = rows.read("domain_gradients", first, first + len(nodes))[near]
+                    found = np.einsum("cai,caj->cij", speed[cells[near]], gradients)
+                    steepest = max(steepest, float(np.sqrt((found**2).sum(axis=(1, 2)).max())))
         return steepest
 
 
@@ -145,16 +148,14 @@ def localise(
     def local(nodes: NDArray[np.int64]) -> NDArray[np.uint32]:
         return np.searchsorted(rows.nodes, nodes).astype(np.uint32, copy=False)
 
-    n_hexahedra = len(rows.hexahedra)
-    mu = np.array([material.mu for material in rows.materials])[rows.material]
-    lam = np.array([material.lam for material in rows.materials])[rows.material]
-    lame = np.stack([mu, lam])
-    cells = local(rows.hexahedra)
-    box, edges = _boxes(rows.points, cells)
-    along = _along(cells)
-    breaks = _run_breaks(cells, box & (along >= 0), edges, rows.material[:n_hexahedra])
-    in_runs = np.repeat(np.diff(breaks) >= SHORTEST_RUN, np.diff(breaks)) & box & (along >= 0)
-    general = np.flatnonzero(~in_runs)
+    n_hexahedra, points, material = rows.n_own_hexahedra, rows.read("points"), rows.read("material")
+    lame = np.array([[m.mu, m.lam] for m in rows.materials]).T  # (2, n_materials)
+    cells = np.empty((n_hexahedra, 8), np.uint32)
+    for start, nodes in rows.blocks("hexahedra"):
+        cells[start : start + len(nodes)] = local(nodes)
+    found = _find_runs(points, cells, material[:n_hexahedra])
+    general = np.flatnonzero(~found.in_runs)
+    domains = local(rows.read("domains"))
     shared = np.zeros(len(rows.nodes), bool)
     shared[local(rows.shared)] = True
     dofs = 3 * local(rows.prescribed_dofs // 3) + (rows.prescribed_dofs % 3).astype(np.uint32)
@@ -162,17 +163,19 @@ def localise(
     moves = (rows.prescribed_displacements != 0) | turns
     return Subdomain(
         rows=rows,
+        domain_nodes=domains,
+        domain_shapes=rows.read("domain_shapes"),
         n_nodes=len(rows.nodes),
-        n_cells=len(rows.cells),
-        runs=_in(
-            precision, _voxel_runs(cells, along, edges, lame[:, :n_hexahedra], breaks, in_runs, hourglass, shared)
-        ),
+        n_cells=rows.n_own_cells,
+        runs=_in(precision, _voxel_runs(found, lame[:, material[found.first]], hourglass, shared)),
         hexahedra=_in(
             precision,
-            _hexahedron_batches(rows.points, cells, general, lame, len(rows.cells), hourglass, rule, precision, shared),
+            _hexahedron_batches(
+                points, cells, general, lame[:, material[general]], rows.n_own_cells, hourglass, rule, precision, shared
+            ),
         ),
         domains=_in(
-            precision, _domain_batches(rows, local(rows.domains), lame[:, n_hexahedra:], stabilisation, shared)
+            precision, _domain_batches(rows, points, domains, lame[:, material[n_hexahedra:]], stabilisation, shared)
         ),
         fixed=dofs[~moves],
         moving=dofs[moves],
@@ -192,9 +195,7 @@ def cell_costs(
     points: NDArray[np.float64], hexahedra: NDArray[np.int64], domains: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """What each cell of a model costs in a step, (n_cells,): see `GATHERED_COST`."""
-    box, edges = _boxes(points, hexahedra)
-    breaks = _run_breaks(hexahedra, box & (_along(hexahedra) >= 0), edges, np.zeros(len(hexahedra), np.int16))
-    in_runs = np.repeat(np.diff(breaks) >= SHORTEST_RUN, np.diff(breaks))
+    in_runs = _find_runs(points, hexahedra, np.zeros(len(hexahedra), np.int16)).in_runs
     of_domain = DOMAIN_NODE_COST * domains.shape[1]
     return np.concatenate([np.where(in_runs, 1.0, GATHERED_COST), np.full(len(domains), of_domain)])
 
@@ -233,44 +234,56 @@ def _along(cells: NDArray[np.integer]) -> NDArray[np.int8]:
     return along
 
 
-def _run_breaks(
-    cells: NDArray[np.integer], box: NDArray[np.bool_], edges: NDArray[np.float64], material: NDArray[np.int16]
-) -> NDArray[np.int64]:
-    """First cells of rows of equal boxes with nodes in a row, and the number of cells."""
+@dataclass(frozen=True, slots=True)
+class _Runs:
+    """Rows of equal boxes whose nodes follow each other, of hexahedra (n, 8)."""
+
+    in_runs: NDArray[np.bool_]  # (n,)
+    first: NDArray[np.int64]  # (n_runs,), their first cells
+    length: NDArray[np.int64]
+    along: NDArray[np.int64]  # the axis
+    near: NDArray[np.int64]  # (n_runs, 4), the first cells' near nodes
+    edges: NDArray[np.float64]  # (n_runs, 3), m
+
+
+def _find_runs(points: NDArray[np.float64], cells: NDArray[np.integer], material: NDArray[np.int16]) -> _Runs:
+    """Block by block, so that what is known of each cell takes no room."""
     n = len(cells)
-    if n == 0:
-        return np.zeros(1, np.int64)
-    follows = (cells[1:].astype(np.int64) - cells[:-1] == 1).all(axis=1) & box[1:] & box[:-1]
-    follows &= material[1:] == material[:-1]
-    follows &= (np.abs(edges[1:] - edges[:-1]) <= BOX_TOLERANCE * edges[1:]).all(axis=1)
-    return np.concatenate([[0], np.flatnonzero(~follows) + 1, [n]])
+    good, breaks = np.zeros(n, bool), [np.zeros(min(n, 1), np.int64)]
+    for start in range(0, n, BLOCK):
+        some = cells[max(0, start - 1) : start + BLOCK]  # and the cell before, which the first may follow
+        box, edges = _boxes(points, some)
+        box &= _along(some) >= 0
+        follows = (some[1:].astype(np.int64) - some[:-1] == 1).all(axis=1) & box[1:] & box[:-1]
+        of = material[max(0, start - 1) : start + BLOCK]
+        follows &= of[1:] == of[:-1]
+        follows &= (np.abs(edges[1:] - edges[:-1]) <= BOX_TOLERANCE * edges[1:]).all(axis=1)
+        breaks.append(max(0, start - 1) + 1 + np.flatnonzero(~follows))
+        good[max(0, start - 1) : start + BLOCK] = box
+    first = np.concatenate(breaks)
+    length = np.diff([*first, n]) if n else np.zeros(0, np.int64)
+    runs = good[first] & (length >= SHORTEST_RUN)
+    in_runs = np.repeat(runs, length)
+    first, length = first[runs], length[runs]
+    along = _along(cells[first]).astype(np.int64)
+    near = np.take_along_axis(cells[first], _LINES[along, :, 0], axis=1).astype(np.int64)
+    return _Runs(in_runs, first, length, along, near, _boxes(points, cells[first])[1])
 
 
 def _voxel_runs(
-    cells: NDArray[np.uint32],
-    along: NDArray[np.int8],
-    edges: NDArray[np.float64],
-    lame: NDArray[np.float64],
-    breaks: NDArray[np.int64],
-    in_runs: NDArray[np.bool_],
-    hourglass: float,
-    shared: NDArray[np.bool_],
+    found: _Runs, lame: NDArray[np.float64], hourglass: float, shared: NDArray[np.bool_]
 ) -> VoxelRuns | None:
-    if not in_runs.any():
+    if len(found.first) == 0:
         return None
-    first, length = breaks[:-1], np.diff(breaks)
-    first, length = first[in_runs[first]], length[in_runs[first]]
-    near = np.take_along_axis(cells[first], _LINES[along[first], :, 0], axis=1).astype(np.int64)
     before = np.concatenate([[0], np.cumsum(shared)])  # so many nodes before each are shared
-    at_border = (before[near + length[:, None] + 1] > before[near]).any(axis=1)
+    at_border = (before[found.near + found.length[:, None] + 1] > before[found.near]).any(axis=1)
     order = np.argsort(~at_border, kind="stable")
-    first, length, near = first[order], length[order], near[order]
-    axis = along[first].astype(np.int64)
+    first, length, axis, near = (a[order] for a in (found.first, found.length, found.along, found.near))
     # Axes in turn from that of the run.
-    edge = np.take_along_axis(edges[first], (axis[:, None] + np.arange(3)) % 3, axis=1).T
+    edge = np.take_along_axis(found.edges[order], (axis[:, None] + np.arange(3)) % 3, axis=1).T
     volume = edge.prod(axis=0)
     gram = 1 / (2 * edge**2)
-    mu, lam = lame[:, first]
+    mu, lam = lame[:, order]
     return VoxelRuns(
         line=np.ascontiguousarray(near.T, dtype=np.uint64),
         length=length.astype(np.uint64),
@@ -302,7 +315,7 @@ def _hexahedron_batches(
     gradient_modes, x_modes, volumes = hexahedra.hadamard(points, nodes, rule)
     gradients, _ = hexahedra.geometry(points, nodes, rule)
     gamma = hexahedra.hourglass_vectors(points, nodes, gradients)
-    mu, lam = lame[:, chosen]
+    mu, lam = lame
     k = hexahedra.hourglass_stiffness(gradients, volumes, hourglass_modulus(lam, mu), hourglass)
     geometry = np.concatenate([gradient_modes.reshape(-1, 18) / 8, x_modes.reshape(-1, 12)], axis=1)
     lanes = _lanes(nodes)
@@ -339,6 +352,7 @@ def _in_row(nodes: NDArray[np.uint32], width: int) -> NDArray[np.bool_]:
 
 def _domain_batches(
     rows: PartRows,
+    points: NDArray[np.float64],
     nodes: NDArray[np.uint32],
     lame: NDArray[np.float64],
     stabilisation: float,
@@ -346,19 +360,19 @@ def _domain_batches(
 ) -> DomainBatches | None:
     if len(nodes) == 0:
         return None
-    position, inverse = support.linear_projector(rows.points[nodes])
+    position, inverse = support.linear_projector(points[nodes])
     mu, lam = lame
-    volume = rows.domain_volumes
+    volume, gradients = rows.read("domain_volumes"), rows.read("domain_gradients")
     kappa = support.stabilisation_stiffness(inverse, volume, lam + 2 * mu, stabilisation)
-    gram = np.einsum("gai,gaj->gij", rows.domain_gradients, rows.domain_gradients)
-    numbers = np.arange(len(rows.hexahedra), len(rows.cells), dtype=np.uint32)
+    gram = np.einsum("gai,gaj->gij", gradients, gradients)
+    numbers = np.arange(rows.n_own_hexahedra, rows.n_own_cells, dtype=np.uint32)
     stabilised = stabilisation > 0
     return _border_first(
         DomainBatches,
         shared,
         nodes=_lanes(nodes),
-        cells=_lanes(numbers[:, None], len(rows.cells))[:, 0],
-        gradient=_lanes(rows.domain_gradients),
+        cells=_lanes(numbers[:, None], rows.n_own_cells)[:, 0],
+        gradient=_lanes(gradients),
         position=_lanes(position) if stabilised else None,
         inverse=_lanes(_symmetric(inverse)) if stabilised else None,
         coefficient=_lanes(np.stack([mu * volume, lam * volume, kappa], axis=1), 0),

@@ -81,17 +81,18 @@ class Watch:
         """What and where the cell with the smallest J on this rank is, in a few words."""
         rows, jacobian, state = self.sub.rows, method.survey.jacobian[:-1], method.state
         cell = int(np.argmin(np.where(np.isnan(jacobian), -np.inf, jacobian)))
-        n_hexahedra = len(rows.hexahedra)
-        hexahedron = cell < n_hexahedra
-        nodes = rows.hexahedra[cell] if hexahedron else rows.domains[cell - n_hexahedra]
-        local = np.searchsorted(rows.nodes, nodes)
-        x, y, z = 1e3 * (rows.points[local].mean(axis=0) if hexahedron else rows.domain_points[cell - n_hexahedra])
-        edges = rows.points[local] - rows.points[local].mean(axis=0)
+        hexahedron = cell < rows.n_own_hexahedra
+        kind, k = ("hexahedra", cell) if hexahedron else ("domains", cell - rows.n_own_hexahedra)
+        local = np.searchsorted(rows.nodes, rows.read(kind, k, k + 1)[0])
+        points = rows.read("points")[local]
+        x, y, z = 1e3 * (points.mean(axis=0) if hexahedron else rows.read("domain_points", k, k + 1)[0])
+        edges = points - points.mean(axis=0)
         stretched = edges + state.u[:, local].T - state.u[:, local].T.mean(axis=0)
         stretch = np.linalg.norm(stretched, axis=1).max() / np.linalg.norm(edges, axis=1).max()
+        number, material = (rows.read(name, cell, cell + 1)[0] for name in ("cells", "material"))
         return (
-            f"worst is {'hexahedron' if hexahedron else 'support domain'} {rows.cells[cell]} "
-            f"({rows.materials[rows.material[cell]].name}) at ({x:.1f}, {y:.1f}, {z:.1f}) mm on rank {self.world.rank} "
+            f"worst is {'hexahedron' if hexahedron else 'support domain'} {number} "
+            f"({rows.materials[material].name}) at ({x:.1f}, {y:.1f}, {z:.1f}) mm on rank {self.world.rank} "
             f"with J = {jacobian[cell]:.3g} now, {state.smallest_jacobian:.3g} at its worst, and a stretch "
             f"of {stretch:.3g}"
         )

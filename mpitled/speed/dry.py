@@ -37,7 +37,7 @@ def dry_run(deck: Deck, directory: Path, world: World) -> str:
     calls, surveyed = witness(terms), witness([("survey", method.look)])
     seconds, survey = forecast.measure(method)
     step = sum(seconds.values())
-    counts = [len(sub.rows.hexahedra), len(sub.rows.domains), sub.n_nodes, sum(len(nodes) for _, nodes in sub.shared)]
+    counts = [sub.rows.n_own_hexahedra, sub.rows.n_own_domains, sub.n_nodes, sum(len(nodes) for _, nodes in sub.shared)]
     sizes = [distinct_bytes(calls) / sub.n_cells, _held_bytes(method) / sub.n_cells]
     table = world.gather([*counts, *sizes, 1e3 * step, 1e3 * survey])
     lines = [
@@ -107,7 +107,7 @@ def _left_out(deck: Deck, sub: Subdomain, ranks: int, calls: Sequence[Call]) -> 
 def reasons(deck: Deck, sub: Subdomain, ranks: int) -> dict[str, str]:
     """Why each kernel is not called, if it is not; "" where it may yet be, later in the run."""
     relaxes = deck.solver.method == "dynamic-relaxation"
-    hexahedra = "no hexahedra" if len(sub.rows.hexahedra) == 0 else ""
+    hexahedra = "no hexahedra" if sub.rows.n_own_hexahedra == 0 else ""
     voxels = hexahedra or f"no {SHORTEST_RUN} equal boxes in a row"
     general = hexahedra or f"all hexahedra are boxes, {SHORTEST_RUN} or more in a row"
     domains = "no support domains"
@@ -128,7 +128,8 @@ def reasons(deck: Deck, sub: Subdomain, ranks: int) -> dict[str, str]:
         "change_step": method if relaxes else "",
         "kinetic_energy": method,
         "raise_mass": heavier,
-        "renew_masses": method,
+        "keep_masses": method,
+        "invert_masses": method,
         "watch_relaxation": method,
         "gather": alone,
         "add": alone,

@@ -104,20 +104,14 @@ def main() -> None:
 
 def _count(path: Path, stabilisation: float) -> dict[str, float]:
     rows = store.read_part(path, 1, 0)
-    whole = len(rows.domains) // BATCH_LANES * BATCH_LANES  # lanes that fill the last batch are no work of cells
-    domains = {name: getattr(rows, name)[:whole] for name in _OF_DOMAINS}
-    n_hexahedra = len(rows.hexahedra)
-    kept = n_hexahedra + whole
-    rows = replace(rows, cells=rows.cells[:kept], material=rows.material[:kept], **domains)
-    sub = localise(rows, HOURGLASS, stabilisation, "mean")
+    whole = rows.n_own_domains // BATCH_LANES * BATCH_LANES  # lanes that fill the last batch are no work of cells
+    n_hexahedra = rows.n_own_hexahedra
+    sub = localise(replace(rows, n_own_domains=whole), HOURGLASS, stabilisation, "mean")
     in_runs = int(sub.runs.length.sum()) if sub.runs else 0
     work = {"voxel hexahedra": in_runs, "hexahedra": n_hexahedra - in_runs, "support domains": whole}
     sub, state = (with_values(part, _to_counting) for part in (sub, at_rest(sub, 1.0, 1e-6)))
     terms = (*compose_forces(sub, None), *compose_march(sub))
     return {name: _operations(act, state) / (work.get(name) or sub.n_nodes) for name, act in terms}
-
-
-_OF_DOMAINS = ("domains", "domain_points", "domain_volumes", "domain_gradients", "domain_shapes")
 
 
 def _operations(act: Callable[..., None], state: Any) -> int:

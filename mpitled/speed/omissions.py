@@ -36,7 +36,7 @@ class Scene:
 
 
 def _one_material(scene: Scene) -> Scene:
-    return replace(scene, rows=replace(scene.rows, material=np.zeros_like(scene.rows.material)))
+    return replace(scene, rows=scene.rows.holding(material=np.zeros(scene.rows.n_own_cells, np.int16)))
 
 
 def _straight(scene: Scene) -> Scene:
@@ -50,7 +50,7 @@ def _fixed(scene: Scene) -> Scene:
 
 #: What is left out, and how; each alone, then all.
 OMISSIONS: dict[str, Callable[[Scene], Scene]] = {
-    "cells that are no boxes": lambda s: replace(s, rows=replace(s.rows, points=s.boxes.points)),
+    "cells that are no boxes": lambda s: replace(s, rows=s.rows.holding(points=s.boxes.read("points"))),
     "hourglass control": lambda s: replace(s, hourglass=0.0),
     "stabilisation": lambda s: replace(s, stabilisation=0.0),
     "several materials": _one_material,
@@ -70,9 +70,10 @@ def measure(quick: bool) -> str:
         boxes = store.read_part(Path(told["model"]), 1, 0)
     turns = np.where(boxes.prescribed_displacements[:, None] != 0, [0.1, 1e-3, 1e-3], 0.0)
     # A shear makes parallelepipeds of boxes: as many cells, but for the general kernel.
-    sheared = boxes.points + 1e-3 * boxes.points[:, [2, 0, 1]]
+    points = boxes.read("points")
+    sheared = points + 1e-3 * points[:, [2, 0, 1]]
     everything = Scene(
-        replace(boxes, points=sheared, prescribed_turns=turns), boxes, told["hourglass"], told["stabilisation"]
+        replace(boxes.holding(points=sheared), prescribed_turns=turns), boxes, told["hourglass"], told["stabilisation"]
     )
     scenes = {"": everything} | {name: leave_out(everything) for name, leave_out in OMISSIONS.items()}
     least = everything
@@ -81,7 +82,7 @@ def measure(quick: bool) -> str:
     scenes["all of these"] = least
     paces = {name: scene.composed() for name, scene in scenes.items()}
     seconds = timed({name: pace.take for name, pace in paces.items()}, World(), repeats, span)
-    n_cells = len(boxes.cells)
+    n_cells = boxes.n_own_cells
     lines = [f"{'left out':26}{'M cells/s':>10}{'gain':>8}"]
     for name, took in seconds.items():
         lines.append(f"{name or '(everything on)':26}{n_cells / took / 1e6:10.2f}{seconds[''] / took:8.2f}")

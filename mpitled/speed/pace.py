@@ -52,7 +52,7 @@ class Pace:
 
     def work(self) -> dict[str, int]:
         """Cells that the terms of forces have to do."""
-        n_hexahedra = len(self.sub.rows.hexahedra)
+        n_hexahedra = self.sub.rows.n_own_hexahedra
         in_runs = int(self.sub.runs.length.sum()) if self.sub.runs else 0
         return {
             "voxel hexahedra": in_runs,
@@ -68,9 +68,10 @@ def made(sub: Subdomain, world: World, relaxed: bool = False) -> Pace:
         mobility, components = state.mobility, Relaxation.components(sub)
         state.mobility = np.zeros((components, sub.n_nodes))
         state.mobility[[0] if components == 1 else [0, 3, 5]] = mobility
-    x = sub.rows.points.T
+    points = sub.rows.read("points")
+    x = points.T
     x = (x - x.mean(axis=1, keepdims=True)) / np.ptp(x)
-    strained = _STRAIN * np.ptp(sub.rows.points) * (x[[1, 2, 0]] + np.sin(2 * np.pi * _WAVES * x) / (6 * _WAVES))
+    strained = _STRAIN * np.ptp(points) * (x[[1, 2, 0]] + np.sin(2 * np.pi * _WAVES * x) / (6 * _WAVES))
     state.place(strained)
     state.time = _SHARE * state.load_time
     halo = Halo(world, sub.shared, 3, sub.precision) if world.size > 1 else None

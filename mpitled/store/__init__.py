@@ -25,11 +25,19 @@ from mpitled.store.models import (
     read_sets,
     write_model,
 )
-from mpitled.store.partitions import PartRows, has_partition, partition_mark, read_part, write_partition
+from mpitled.store.partitions import (
+    BLOCK,
+    PartRows,
+    has_partition,
+    partition_mark,
+    read_part,
+    write_partition,
+)
 from mpitled.store.results import Result, is_result, is_unfinished, open_result, unfinished_bytes
 from mpitled.store.writer import ResultWriter, result_bytes
 
 __all__ = [
+    "BLOCK",
     "CHECKPOINTS",
     "MODEL_ARRAYS",
     "PartRows",

@@ -67,7 +67,7 @@ def write_checkpoint(
 
             def write(name: str, n_rows: int, slabs: Slabs, values: NDArray[Any]) -> None:
                 made = make(file, name, (n_rows, *values.shape[1:]), values.dtype)
-                shares[name] = write_rows(made, slabs, values, 0, transfer)
+                shares[name] = write_rows(made, slabs, [values], 0, transfer)
 
             write("node", part.n_nodes, slabs, part.nodes[part.owned])
             for name, values in nodal.items():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -230,16 +230,22 @@ def slabs_of(totals: NDArray[np.int64], before: NDArray[np.int64], counts: NDArr
 
 
 def write_rows(
-    dataset: h5py.Dataset, slabs: Slabs, values: NDArray[Any], first_row: int, transfer: h5py.h5p.PropDXID | None
+    dataset: h5py.Dataset,
+    slabs: Slabs,
+    pieces: Sequence[NDArray[Any]],
+    first_row: int,
+    transfer: h5py.h5p.PropDXID | None,
 ) -> int:
-    """Write the rows of this rank in one collective call, which a rank without rows makes as well.
+    """Write the rows of this rank, a piece for each slab, in one collective call, which a rank without any makes too.
 
     Its share of the checksum of the rows from first_row on.
     """
     shape = (sum(count for _, count in slabs), *dataset.shape[1:])
-    if values.shape != shape:
-        raise ValueError(f"{dataset.name}: {values.shape} values for rows of shape {shape}")
-    values = np.ascontiguousarray(values, dataset.dtype)
+    for (_, count), piece in zip(slabs, pieces, strict=True):
+        if piece.shape != (count, *shape[1:]):
+            raise ValueError(f"{dataset.name}: {piece.shape} values for {count} rows of shape {shape[1:]}")
+    some = [piece for piece in pieces if len(piece)] or pieces[:1]
+    values = np.ascontiguousarray(some[0] if len(some) == 1 else np.concatenate(some), dataset.dtype)
     space, memory = dataset.id.get_space(), h5py.h5s.create_simple(shape)
     space.select_none()
     entries, done, shares = int(np.prod(shape[1:])), 0, 0

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled.errors import InputError
+from mpitled.errors import InputError, damaged
 from mpitled.material import Material
-from mpitled.store.files import check_room, matching, put, read_rows, replacing
+from mpitled.store.files import REBUILD, check_room, matching, open_file, put, read_rows, replacing
 from mpitled.store.models import check_ascending, check_finite, check_numbers, open_model, read_materials
 
 if TYPE_CHECKING:
@@ -70,11 +71,27 @@ def partition_mark(path: Path, n_parts: int) -> str:
         return f"{n_parts}:{int(file[f'partitions/{n_parts}/nodes'].attrs['checksum']) % (1 << 64):016x}"
 
 
+#: Rows first to last of a column, in the part's order.
+Source = Callable[[str, int, int], NDArray[Any]]
+_OF_NODES = ("node_ids", "rows", "points", "mass")
+_OF_HEXAHEDRA = ("hexahedra",)
+_OF_DOMAINS = ("domains", "domain_points", "domain_volumes", "domain_gradients", "domain_shapes")
+_OF_CELLS = ("cells", "material")
+
+
 @dataclass(frozen=True, slots=True)
 class PartRows:
     """The rows of the model that one part needs, in SI units and global numbers.
 
-    A cell is on one part; a node is on every part whose cells touch it, and the lowest of them owns it.
+    A cell is on one part; a node is on every part whose cells touch it, and the lowest of them owns it. The long
+    columns stay where they are until they are asked for (`read`), so that a run need not hold what it needs once:
+
+    - of `nodes`: "node_ids" (k,), numbers in the file that they came from; "rows" (k,) in the result files; "points"
+      (k, 3), m; "mass" (k,), kg, of the whole model's cells;
+    - of cells, this part's hexahedra and then its support domains: "cells" (n,) ascending; "material" (n,);
+    - "hexahedra" (n_own_hexahedra, 8), nodes;
+    - of support domains: "domains" (n_own_domains, n), nodes; "domain_points" (.., 3), m; "domain_volumes" (..,), m^3;
+      "domain_gradients" (.., n, 3), 1/m; "domain_shapes" (.., n).
     """
 
     n_parts: int
@@ -83,49 +100,110 @@ class PartRows:
     n_fe_nodes: int  # of the whole model
     n_hexahedra: int  # of the whole model
     n_domains: int  # of the whole model
-    cells: NDArray[np.int64]  # (n,) ascending: this part's hexahedra, then its support domains
-    nodes: NDArray[np.int64]  # (k,) ascending nodes that these cells touch
-    node_ids: NDArray[np.int64]  # (k,) numbers in the file that the nodes came from
-    rows: NDArray[np.int64]  # (k,) row of each node in the result files
+    n_own_hexahedra: int
+    n_own_domains: int
+    nodes: NDArray[np.int64]  # (k,) ascending nodes that the part's cells touch
     owned: NDArray[np.bool_]  # (k,)
     first_row: int  # row of the first owned node; owned nodes follow each other
-    points: NDArray[np.float64]  # (k, 3), m
-    mass: NDArray[np.float64]  # (k,), kg, of the whole model's cells
-    hexahedra: NDArray[np.int64]  # (n_own_hexahedra, 8), nodes
-    domains: NDArray[np.int64]  # (n_own_domains, n), nodes
-    domain_points: NDArray[np.float64]  # (n_own_domains, 3), m
-    domain_volumes: NDArray[np.float64]  # (n_own_domains,), m^3
-    domain_gradients: NDArray[np.float64]  # (n_own_domains, n, 3), 1/m
-    domain_shapes: NDArray[np.float64]  # (n_own_domains, n)
-    material: NDArray[np.int16]  # (n,)
     materials: tuple[Material, ...]
     prescribed_dofs: NDArray[np.int64]  # ascending 3 node + direction, on `nodes`
     prescribed_displacements: NDArray[np.float64]  # m
     prescribed_turns: NDArray[np.float64]  # (len(prescribed_dofs), 3)
-    field_nodes: NDArray[np.int64]  # ascending EFG nodes whose field one of `domains` gives; not all in `nodes`
+    field_nodes: NDArray[np.int64]  # ascending EFG nodes whose field one of "domains" gives; not all in `nodes`
     field_domains: NDArray[np.int64]  # the support domain of each, a number of the whole model
     field_shapes: NDArray[np.float64]  # (len(field_nodes), n)
     neighbours: NDArray[np.int32]  # ascending parts that share nodes with this one
     shared: NDArray[np.int64]  # ascending nodes shared with each neighbour in turn
     shared_offsets: NDArray[np.int64]  # (len(neighbours) + 1,) into `shared`
+    source: Source
+
+    @property
+    def n_own_cells(self) -> int:
+        return self.n_own_hexahedra + self.n_own_domains
+
+    def length(self, name: str) -> int:
+        """Rows of a column."""
+        if name in _OF_NODES:
+            return len(self.nodes)
+        return {_OF_HEXAHEDRA: self.n_own_hexahedra, _OF_DOMAINS: self.n_own_domains, _OF_CELLS: self.n_own_cells}[
+            next(names for names in (_OF_HEXAHEDRA, _OF_DOMAINS, _OF_CELLS) if name in names)
+        ]
+
+    def read(self, name: str, first: int = 0, last: int | None = None) -> NDArray[Any]:
+        """Rows first to last of a long column, from the file. InputError if it cannot be read any more."""
+        return self.source(name, first, self.length(name) if last is None else last)
+
+    def blocks(self, name: str) -> Iterator[tuple[int, NDArray[Any]]]:
+        """A long column in blocks, each with its first row."""
+        length = self.length(name)
+        for first in range(0, length, BLOCK):
+            yield first, self.read(name, first, min(first + BLOCK, length))
+
+    def holding(self, **columns: NDArray[Any]) -> PartRows:
+        """The same with other columns in place of the file's."""
+
+        def source(name: str, first: int, last: int) -> NDArray[Any]:
+            return columns[name][first:last] if name in columns else self.source(name, first, last)
+
+        return replace(self, source=source)
+
+
+#: Rows of long columns at a time.
+BLOCK = 1 << 16
+
+
+class _File:
+    """The long columns of one part in an open model; it stays open, whatever becomes of its name."""
+
+    def __init__(self, path: Path, n_parts: int, part: int, nodes: NDArray[np.int64]) -> None:
+        """nodes: of the part, ascending."""
+        self._file, self._path, self._nodes = open_file(path), path, nodes
+        self._group = None if n_parts == 1 else self._file[f"partitions/{n_parts}"]
+        self._n_hexahedra = len(self._file["hexahedra"])
+        self._cells = slice(0, 0) if self._group is None else _range(self._group["cell_offsets"], part)
+        cells = self.numbers(0, self._cells.stop - self._cells.start)
+        self.n_own_hexahedra = int(np.searchsorted(cells, self._n_hexahedra))
+
+    def numbers(self, first: int, last: int) -> NDArray[np.int64]:
+        """Of cells of the part in the whole model."""
+        if self._group is None:
+            return np.arange(first, last)
+        return np.asarray(self._group["cells"][self._cells.start + first : self._cells.start + last], np.int64)
+
+    def __call__(self, name: str, first: int, last: int) -> NDArray[Any]:
+        with damaged(self._path, REBUILD):
+            if name in _OF_NODES:
+                if self._group is not None:
+                    return read_rows((self._group if name == "rows" else self._file)[name], self._nodes[first:last])
+                return np.arange(first, last) if name == "rows" else np.asarray(self._file[name][first:last])
+            if name == "cells":
+                return self.numbers(first, last)
+            if self._group is None:
+                return np.asarray(self._file[name][first:last])
+            if name in _OF_DOMAINS:
+                before = self.n_own_hexahedra
+                return read_rows(self._file[name], self.numbers(before + first, before + last) - self._n_hexahedra)
+            return read_rows(self._file[name], self.numbers(first, last))
 
 
 def read_part(path: Path, n_parts: int, part: int) -> PartRows:
-    """The rows of part `part` of `n_parts`, without holding those of others.
+    """The rows of part `part` of `n_parts`, without holding those of others; the file stays open for `PartRows.read`.
 
     InputError if the model has no such partition.
     """
     with open_model(path) as file:
         n_nodes, n_hexahedra, n_domains = (len(file[name]) for name in ("points", "hexahedra", "domains"))
         if n_parts == 1:
-            cells, nodes, rows = np.arange(n_hexahedra + n_domains), np.arange(n_nodes), np.arange(n_nodes)
+            nodes = rows = np.arange(n_nodes)
+            source = _File(path, n_parts, part, nodes)
+            n_own_hexahedra, n_own_cells = n_hexahedra, n_hexahedra + n_domains
+            own_domains = np.arange(n_domains)
             first_row, end_row = 0, n_nodes
             neighbours, shared, shared_offsets = np.empty(0, np.int32), np.empty(0, np.int64), np.zeros(1, np.int64)
         else:
             if f"partitions/{n_parts}" not in file:
                 raise InputError(f"{path}: has no partition in {n_parts} parts; partition the model first")
             group = file[f"partitions/{n_parts}"]
-            cells = group["cells"][_range(group["cell_offsets"], part)]
             nodes = group["nodes"][_range(group["node_offsets"], part)]
             check_numbers(nodes, len(group["rows"]), "nodes")
             rows = read_rows(group["rows"], nodes)
@@ -136,6 +214,7 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
             check_numbers(shared_offsets, len(group["shared"]) + 1, "shared_offsets")
             shared = group["shared"][shared_offsets[0] : shared_offsets[-1]]
             shared_offsets = shared_offsets - shared_offsets[0]
+            cells = group["cells"][_range(group["cell_offsets"], part)]
             if len(shared_offsets) != len(neighbours) + 1 or (np.diff(shared_offsets) < 0).any():
                 raise ValueError("shared_offsets do not fit the neighbours")
             for name, numbers, end in (("neighbours", neighbours, n_parts), ("rows", rows, n_nodes)):
@@ -145,21 +224,14 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
                 check_ascending(numbers, name)
             if part in neighbours or not np.isin(shared, nodes).all():
                 raise ValueError("a part shares with itself, or nodes that are not its own")
+            source = _File(path, n_parts, part, nodes)
+            n_own_hexahedra, n_own_cells = source.n_own_hexahedra, len(cells)
+            own_domains = cells[n_own_hexahedra:] - n_hexahedra
 
-        own_hexahedra, own_domains = np.split(cells, [np.searchsorted(cells, n_hexahedra)])
-        own_domains = own_domains - n_hexahedra
         dofs, prescribed = matching(file["prescribed_dofs"], nodes, 3)
         field_domains, fields_here = matching(file["field_domains"], own_domains, 1)
         n_fe_nodes = int(file.attrs["n_fe_nodes"])
-        hexahedra, domains = read_rows(file["hexahedra"], own_hexahedra), read_rows(file["domains"], own_domains)
-        material, materials = read_rows(file["material"], cells), read_materials(file)
-        check_numbers(material, len(materials), "material")
         check_ascending(dofs, "prescribed_dofs")
-        for name, numbers in (("hexahedra", hexahedra), ("domains", domains)):
-            # As `localise` will find them: a node of which this part has no copy would be beyond its arrays.
-            check_numbers(numbers, n_nodes, name)
-            if numbers.size and not (nodes.take(np.searchsorted(nodes, numbers), mode="clip") == numbers).all():
-                raise ValueError(f"{name} have nodes that their part has not")
         part_rows = PartRows(
             n_parts=n_parts,
             part=part,
@@ -167,22 +239,12 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
             n_fe_nodes=n_fe_nodes,
             n_hexahedra=n_hexahedra,
             n_domains=n_domains,
-            cells=cells,
+            n_own_hexahedra=n_own_hexahedra,
+            n_own_domains=n_own_cells - n_own_hexahedra,
             nodes=nodes,
-            node_ids=read_rows(file["node_ids"], nodes),
-            rows=rows,
             owned=(rows >= first_row) & (rows < end_row),
             first_row=int(first_row),
-            points=read_rows(file["points"], nodes),
-            mass=read_rows(file["mass"], nodes),
-            hexahedra=hexahedra,
-            domains=domains,
-            **{
-                name: read_rows(file[name], own_domains)
-                for name in ("domain_points", "domain_volumes", "domain_gradients", "domain_shapes")
-            },
-            material=material,
-            materials=materials,
+            materials=read_materials(file),
             prescribed_dofs=dofs,
             prescribed_displacements=read_rows(file["prescribed_displacements"], prescribed),
             prescribed_turns=read_rows(file["prescribed_turns"], prescribed),
@@ -192,9 +254,26 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
             neighbours=neighbours,
             shared=shared,
             shared_offsets=shared_offsets,
+            source=source,
         )
         check_finite({f.name: v for f in fields(PartRows) if isinstance(v := getattr(part_rows, f.name), np.ndarray)})
+        _check_columns(part_rows)
         return part_rows
+
+
+def _check_columns(part: PartRows) -> None:
+    """ValueError unless the long columns hold what they may."""
+    for name in (*_OF_NODES, *_OF_CELLS, *_OF_HEXAHEDRA, *_OF_DOMAINS):
+        for _, values in part.blocks(name):
+            if name in ("hexahedra", "domains"):
+                # As `localise` will find them: a node of which this part has no copy would be beyond its arrays.
+                check_numbers(values, part.n_nodes, name)
+                if not (part.nodes.take(np.searchsorted(part.nodes, values), mode="clip") == values).all():
+                    raise ValueError(f"{name} have nodes that their part has not")
+            elif name == "material":
+                check_numbers(values, len(part.materials), name)
+            else:
+                check_finite({name: values})
 
 
 def _range(offsets: h5py.Dataset, part: int) -> slice:

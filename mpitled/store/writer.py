@@ -28,7 +28,7 @@ from mpitled.store.files import (
     write_rows,
     writing,
 )
-from mpitled.store.partitions import PartRows
+from mpitled.store.partitions import BLOCK, PartRows
 from mpitled.store.results import (
     EFG_NODE,
     FINISHED,
@@ -166,8 +166,8 @@ class ResultWriter:
         """Write the first frames of a file that was written in other parts."""
         part = self._part
         nodes, in_nodes = old.find("node_id", part.nodes[part.owned])
-        cells, in_cells = old.find("cell_id", part.cells)
-        points = old.point_rows(in_cells[cells][len(part.hexahedra) :])
+        cells, in_cells = old.find("cell_id", part.read("cells"))
+        points = old.point_rows(in_cells[cells][part.n_own_hexahedra :])
         order = np.argsort(points)
         back = np.argsort(order)
         for k in range(frames):
@@ -195,7 +195,7 @@ class ResultWriter:
         """Write one frame; it counts once it is on its way to the disc.
 
         Point data: (owned nodes + own support domains, components), nodes ascending, then integration points.
-        Cell data: (own cells, components) in the order of `PartRows.cells`. Rank 0's time (s) and series are kept.
+        Cell data: (own cells, components) in the order of the part's "cells". Rank 0's time (s) and series are kept.
         """
         if self._frame == self._n_frames:
             raise ValueError(f"{self._n_frames} frames were announced, and one more is written")
@@ -206,7 +206,8 @@ class ResultWriter:
         shares = {"series": checksum.share(series_of(time, series or {}), 0) if self._leads else 0}
         with writing(self._partial):
             for name, values in point_data.items():
-                shares[f"PointData/{name}"] = self._write(grid["PointData"][name], self._point_slabs, values, point_row)
+                pieces = np.split(values, [self._n_owned])
+                shares[f"PointData/{name}"] = self._write(grid["PointData"][name], self._point_slabs, pieces, point_row)
             for name, values in cell_data.items():
                 shares[f"CellData/{name}"] = self._write(
                     grid["CellData"][name], self._cell_slabs, self._with_efg(values, np.nan), cell_row
@@ -272,11 +273,12 @@ class ResultWriter:
         """Where this rank's rows are."""
         part = self._part
         efg = part.owned & (part.nodes >= part.n_fe_nodes)
-        counts = np.array([part.owned.sum(), len(part.hexahedra), efg.sum(), len(part.domains)])
+        counts = np.array([part.owned.sum(), part.n_own_hexahedra, efg.sum(), part.n_own_domains])
         by_rank = np.array([counts] if self._comm is None else self._comm.allgather(counts))
+        self._most_hexahedra = int(by_rank[:, 1].max())
         totals, before = by_rank.sum(axis=0), by_rank[: part.part].sum(axis=0)
         self._counts, self._all_counts, self._counts_before = counts, totals, before
-        self._n_efg = int(counts[2])
+        self._n_owned, self._n_efg = int(counts[0]), int(counts[2])
         self._n_points, self._n_cells = int(totals[[0, 3]].sum()), int(totals[1:].sum())
         self._point_slabs = slabs_of(totals[[0, 3]], before[[0, 3]], counts[[0, 3]])
         self._cell_slabs = slabs_of(totals[1:], before[1:], counts[1:])
@@ -288,7 +290,7 @@ class ResultWriter:
         sizes = np.array([8, 1, 1])
         corner_slabs = slabs_of(sizes * totals[1:], sizes * before[1:], sizes * counts[1:])
         integration_rows = totals[0] + before[3] + np.arange(counts[3])
-        corners = part.rows[np.searchsorted(part.nodes, part.hexahedra)].ravel()
+        rows = part.read("rows")
         # Offsets say where each cell's corners end, after a first row that says where they begin.
         ends = [
             first + size * np.arange(1, n // size + 1) for (first, n), size in zip(corner_slabs, sizes, strict=True)
@@ -305,25 +307,31 @@ class ResultWriter:
         self._table(grid, "NumberOfCells", [self._n_cells])
         self._table(grid, "NumberOfConnectivityIds", [n_corners])
 
-        def write(name: str, slabs: Slabs, n_rows: int, values: NDArray[Any]) -> None:
-            made = make(grid, name, (n_rows, *values.shape[1:]), values.dtype)
-            self._shares[name] = self._write(made, slabs, values)
+        def write(name: str, slabs: Slabs, n_rows: int, pieces: Sequence[NDArray[Any]]) -> None:
+            made = make(grid, name, (n_rows, *pieces[0].shape[1:]), pieces[0].dtype)
+            self._shares[name] = self._write(made, slabs, pieces)
 
-        points = np.concatenate([part.points[owned], part.domain_points])
-        write("Points", self._point_slabs, self._n_points, points)
-        write("Connectivity", corner_slabs, n_corners, np.concatenate([corners, part.rows[efg], integration_rows]))
-        write("Offsets", end_slabs, self._n_cells + 1, np.concatenate(ends))
-        kinds = np.repeat(np.array([HEXAHEDRON, EFG_NODE, INTEGRATION_POINT], np.uint8), counts[1:])
-        types = np.where(kinds == HEXAHEDRON, _VTK_HEXAHEDRON, _VTK_VERTEX).astype(np.uint8)
-        write("Types", self._cell_slabs, self._n_cells, types)
+        def of_kinds(values: Sequence[int], dtype: Any) -> list[NDArray[Any]]:
+            return [np.full(n, value, dtype) for value, n in zip(values, counts[1:], strict=True)]
+
+        write("Points", self._point_slabs, self._n_points, [part.read("points")[owned], part.read("domain_points")])
+        made = make(grid, "Connectivity", (n_corners,), np.int64)
+        share = self._write(made, corner_slabs[1:], [rows[efg], integration_rows])
+        for first in range(0, self._most_hexahedra, BLOCK):  # by blocks, for it is the longest; as many on all ranks
+            first, last = min(first, counts[1]), min(first + BLOCK, counts[1])
+            corners = rows[np.searchsorted(part.nodes, part.read("hexahedra", first, last))].ravel()
+            share += self._write(made, [(corner_slabs[0][0] + 8 * int(first), len(corners))], [corners])
+        self._shares["Connectivity"] = share
+        write("Offsets", end_slabs, self._n_cells + 1, ends)
+        write("Types", self._cell_slabs, self._n_cells, of_kinds((_VTK_HEXAHEDRON, _VTK_VERTEX, _VTK_VERTEX), np.uint8))
         none = np.full(counts[3], -1)
-        for name, of_nodes in (("node_id", part.nodes), ("node_label", part.node_ids)):
-            write(f"PointData/{name}", self._point_slabs, self._n_points, np.concatenate([of_nodes[owned], none]))
+        for name, of_nodes in (("node_id", part.nodes), ("node_label", part.read("node_ids"))):
+            write(f"PointData/{name}", self._point_slabs, self._n_points, [of_nodes[owned], none])
         for name, of_cells in (
-            ("cell_id", self._with_efg(part.cells, -1)),
-            ("material", self._with_efg(part.material, -1)),
-            ("kind", kinds),
-            ("part", np.full(len(kinds), part.part, np.int32)),
+            ("cell_id", self._with_efg(part.read("cells"), -1)),
+            ("material", self._with_efg(part.read("material"), -1)),
+            ("kind", of_kinds((HEXAHEDRON, EFG_NODE, INTEGRATION_POINT), np.uint8)),
+            ("part", of_kinds((part.part,) * 3, np.int32)),
         ):
             write(f"CellData/{name}", self._cell_slabs, self._n_cells, of_cells)
 
@@ -359,11 +367,11 @@ class ResultWriter:
             self._table(steps, f"FieldDataOffsets/{name}", np.arange(n))
             self._table(steps, f"FieldDataSizes/{name}", np.ones((n, 2)))
 
-    def _with_efg(self, values: NDArray[Any], filler: float) -> NDArray[Any]:
+    def _with_efg(self, values: NDArray[Any], filler: float) -> list[NDArray[Any]]:
         """Values of own cells with `filler` for the vertices of EFG nodes, which are no cells of the model."""
         between = np.full((self._n_efg, *values.shape[1:]), filler, values.dtype)
-        n_hexahedra = len(self._part.hexahedra)
-        return np.concatenate([values[:n_hexahedra], between, values[n_hexahedra:]])
+        of_hexahedra, of_domains = np.split(values, [self._part.n_own_hexahedra])
+        return [of_hexahedra, between, of_domains]
 
     def _table(self, group: h5py.Group, name: str, values: Any) -> None:
         """A small dataset of integers that all ranks make and the first writes."""
@@ -373,5 +381,5 @@ class ResultWriter:
         if self._leads:
             dataset[...] = values
 
-    def _write(self, dataset: h5py.Dataset, slabs: Slabs, values: NDArray[Any], first_row: int = 0) -> int:
-        return write_rows(dataset, slabs, values, first_row, self._transfer)
+    def _write(self, dataset: h5py.Dataset, slabs: Slabs, pieces: Sequence[NDArray[Any]], first_row: int = 0) -> int:
+        return write_rows(dataset, slabs, pieces, first_row, self._transfer)

@@ -186,49 +186,51 @@ def raise_mass(u, u_prev, mass, mobility, required, counted, time_step):  # type
 
 
 @njit(cache=True)
-def renew_masses(mass, required, mobility, free, keep):  # type: ignore[no-untyped-def]
-    """mass <- required, mobility <- its inverse, each (1, n), or (6, n): symmetric tensors of the free dofs alone.
+def keep_masses(mass, required, free, keep):  # type: ignore[no-untyped-def]
+    """mass <- required, (1, n), or (6, n): symmetric tensors, of which nothing is left at prescribed dofs.
 
-    free (3, n) is true at free dofs; nothing is left at prescribed ones. A mass that would fall below `keep` of what it
-    was is scaled up to that: cells that swing stiffen again before the next survey. Without mass (None) none is.
+    free (3, n) is true at free dofs. A mass that would fall below `keep` of what it was is scaled up to that: cells
+    that swing stiffen again before the next survey.
     """
     for n in range(required.shape[1]):
         x = 1.0 if free[0, n] else 0.0
         y = 1.0 if free[1, n] else 0.0
         z = 1.0 if free[2, n] else 0.0
         if required.shape[0] == 1:
-            r = required[0, n] * max(x, y, z)
-            if mass is not None:
-                r = max(r, keep * mass[0, n])
-                mass[0, n] = r
-            mobility[0, n] = 1 / r if r > 0 else 0.0
+            mass[0, n] = max(required[0, n] * max(x, y, z), keep * mass[0, n])
             continue
         xx = required[0, n] * x
-        xy = required[1, n] * x * y
-        xz = required[2, n] * x * z
         yy = required[3, n] * y
-        yz = required[4, n] * y * z
         zz = required[5, n] * z
-        if mass is not None:
-            trace = xx + yy + zz
-            least = keep * (mass[0, n] + mass[3, n] + mass[5, n])
-            s = least / trace if 0 < trace < least else 1.0
-            xx *= s
-            xy *= s
-            xz *= s
-            yy *= s
-            yz *= s
-            zz *= s
-            mass[0, n] = xx
-            mass[1, n] = xy
-            mass[2, n] = xz
-            mass[3, n] = yy
-            mass[4, n] = yz
-            mass[5, n] = zz
+        trace = xx + yy + zz
+        least = keep * (mass[0, n] + mass[3, n] + mass[5, n])
+        s = least / trace if 0 < trace < least else 1.0
+        mass[0, n] = s * xx
+        mass[1, n] = s * required[1, n] * x * y
+        mass[2, n] = s * required[2, n] * x * z
+        mass[3, n] = s * yy
+        mass[4, n] = s * required[4, n] * y * z
+        mass[5, n] = s * zz
+
+
+@njit(cache=True)
+def invert_masses(mass, free, mobility):  # type: ignore[no-untyped-def]
+    """mobility <- the inverse of masses (1, n), or of tensors (6, n) at their free dofs, and 0 at the others."""
+    for n in range(mass.shape[1]):
+        if mass.shape[0] == 1:
+            mobility[0, n] = 1 / mass[0, n] if mass[0, n] > 0 else 0.0
+            continue
+        x = 1.0 if free[0, n] else 0.0
+        y = 1.0 if free[1, n] else 0.0
+        z = 1.0 if free[2, n] else 0.0
         # Prescribed dofs take part in the inverse as ones.
-        k0, k1, k2, _, k4, k5, _, _, k8, determinant = cofactor(
-            xx + 1 - x, xy, xz, xy, yy + 1 - y, yz, xz, yz, zz + 1 - z
-        )
+        xx = mass[0, n] * x + 1 - x
+        yy = mass[3, n] * y + 1 - y
+        zz = mass[5, n] * z + 1 - z
+        xy = mass[1, n] * x * y
+        xz = mass[2, n] * x * z
+        yz = mass[4, n] * y * z
+        k0, k1, k2, _, k4, k5, _, _, k8, determinant = cofactor(xx, xy, xz, xy, yy, yz, xz, yz, zz)
         mobility[0, n] = x * k0 / determinant
         mobility[1, n] = x * y * k1 / determinant
         mobility[2, n] = x * z * k2 / determinant
