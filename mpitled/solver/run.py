@@ -83,8 +83,10 @@ class Run:
         self.saved: deque[Memory] = deque(maxlen=2)  # to go back to the older of them; the younger may be ill already
         self.start: Memory = {}  # the numbers of the first, at no load
         self.first_step, self.next_checkpoint = 0, math.inf
-        # The displacements that were good at the last look, their frame's time, and what was seen of them.
-        self.good, self.good_time, self.good_figures = np.zeros((3, sub.n_nodes)), 0.0, self.watch.figures
+        # The displacements that were good at the last look, in single precision, their frame's time, and what was seen
+        # of them.
+        self.good, self.good_time = np.zeros((3, sub.n_nodes), np.float32), 0.0
+        self.good_figures = self.watch.figures
 
     def _halo(self, components: int, precision: type[np.floating] = np.float64) -> Halo | None:
         if self.world.size == 1:

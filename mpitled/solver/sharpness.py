@@ -38,7 +38,7 @@ class Sharpness:
     def __init__(self, sub: Subdomain, world: World, forces: tuple[Term, ...], free: NDArray[np.bool_]) -> None:
         """free (3, n_nodes): see `Subdomain.free`."""
         self._sub, self._world, self._forces, self._free = sub, world, forces, free
-        self.mode: NDArray[np.float64] | None = None  # (3, n_nodes), the last eigenvector
+        self.mode: NDArray[np.floating] | None = None  # (3, n_nodes), the last eigenvector
         self.share = 0.0  # of the bound, that the operator has had at most
         self.wait = 0  # surveys until it is looked for again
         spread = float(np.ptp(sub.rows.read("points"), axis=0).max()) if sub.n_nodes else 0.0
@@ -71,7 +71,9 @@ class Sharpness:
         n, rows, iterations = self._sub.n_nodes, self._sub.rows, FIRST if self.mode is None else AGAIN
         trial = copy(s)
         trial.seen, trial.f = s.seen.copy(), np.empty_like(s.f)
-        mode = self.mode = np.zeros((3, n)) if self.mode is None else self.mode
+        # Whatever it is, it is tried as it is: single precision is enough for it, and a checkpoint has it in double.
+        mode = np.zeros((3, n), np.float32) if self.mode is None else self.mode.astype(np.float32, copy=False)
+        self.mode = mode
         kernels.stir(mode, rows.nodes, self._free, NOISE if mode.any() else 1.0)
         size, weight = self._largest(np.abs(mode).max(initial=0.0)), 0.0
         found = 0.0

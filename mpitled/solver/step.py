@@ -48,7 +48,7 @@ class State:
     external_work: float = 0.0  # J, of the moving dofs that this rank owns
     free_work: float = 0.0  # J, of the internal forces at free dofs that this rank owns; counted in relaxation
 
-    def place(self, u: NDArray[np.float64]) -> None:
+    def place(self, u: NDArray[np.floating]) -> None:
         """Put the nodes at the displacements u (3, n_nodes), at rest."""
         self.u[:, : u.shape[1]] = self.u_prev[:, : u.shape[1]] = u
         self.show()
