@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -273,9 +273,10 @@ class ResultWriter:
         """Where this rank's rows are."""
         part = self._part
         efg = part.owned & (part.nodes >= part.n_fe_nodes)
-        counts = np.array([part.owned.sum(), part.n_own_hexahedra, efg.sum(), part.n_own_domains])
+        counts = np.array([part.owned.sum(), part.n_own_hexahedra, efg.sum(), part.n_own_domains, len(part.nodes)])
         by_rank = np.array([counts] if self._comm is None else self._comm.allgather(counts))
-        self._most_hexahedra = int(by_rank[:, 1].max())
+        self._most_hexahedra, self._most_nodes = by_rank[:, [1, 4]].max(axis=0).tolist()
+        counts, by_rank = counts[:4], by_rank[:, :4]
         totals, before = by_rank.sum(axis=0), by_rank[: part.part].sum(axis=0)
         self._counts, self._all_counts, self._counts_before = counts, totals, before
         self._n_owned, self._n_efg = int(counts[0]), int(counts[2])
@@ -314,13 +315,20 @@ class ResultWriter:
         def of_kinds(values: Sequence[int], dtype: Any) -> list[NDArray[Any]]:
             return [np.full(n, value, dtype) for value, n in zip(values, counts[1:], strict=True)]
 
-        write("Points", self._point_slabs, self._n_points, [part.read("points")[owned], part.read("domain_points")])
+        # What is longest goes by blocks, as many on all ranks.
+        made = make(grid, "Points", (self._n_points, 3), np.float64)
+        (row, _), of_domains = self._point_slabs
+        share = self._write(made, [of_domains], [part.read("domain_points")])
+        for first, last in _blocks(len(part.nodes), self._most_nodes):
+            points = part.read("points", first, last)[owned[first:last]]
+            share += self._write(made, [(row, len(points))], [points])
+            row += len(points)
+        self._shares["Points"] = share
         made = make(grid, "Connectivity", (n_corners,), np.int64)
         share = self._write(made, corner_slabs[1:], [rows[efg], integration_rows])
-        for first in range(0, self._most_hexahedra, BLOCK):  # by blocks, for it is the longest; as many on all ranks
-            first, last = min(first, counts[1]), min(first + BLOCK, counts[1])
+        for first, last in _blocks(part.n_own_hexahedra, self._most_hexahedra):
             corners = rows[np.searchsorted(part.nodes, part.read("hexahedra", first, last))].ravel()
-            share += self._write(made, [(corner_slabs[0][0] + 8 * int(first), len(corners))], [corners])
+            share += self._write(made, [(corner_slabs[0][0] + 8 * first, len(corners))], [corners])
         self._shares["Connectivity"] = share
         write("Offsets", end_slabs, self._n_cells + 1, ends)
         write("Types", self._cell_slabs, self._n_cells, of_kinds((_VTK_HEXAHEDRON, _VTK_VERTEX, _VTK_VERTEX), np.uint8))
@@ -383,3 +391,9 @@ class ResultWriter:
 
     def _write(self, dataset: h5py.Dataset, slabs: Slabs, pieces: Sequence[NDArray[Any]], first_row: int = 0) -> int:
         return write_rows(dataset, slabs, pieces, first_row, self._transfer)
+
+
+def _blocks(length: int, most: int) -> Iterator[tuple[int, int]]:
+    """First and last row of blocks of so many rows; where that is less than most, empty ones follow."""
+    for first in range(0, most, BLOCK):
+        yield min(first, length), min(first + BLOCK, length)
