@@ -135,6 +135,8 @@ class Halo:
                 message, answer = (_NOTHING, _NOTHING) if rank in close else (out, back)
                 requests += [world.comm.Recv_init(answer, rank), world.comm.Send_init(message, rank)]
             self._turns.append((sends, below, above, requests))
+        # Other processors than x86 may show another rank's writes in another order than they were made.
+        self._fence: Callable[[], None] = self._window.Sync if close else lambda: None
         self._start: Callable[[list[Any]], None] = lambda requests: None
         self._wait: Callable[[list[Any]], Any] = lambda requests: None
         if shared:
@@ -148,6 +150,7 @@ class Halo:
         sends, *_, requests = self._turns[0]
         for nodes, buffer in sends:
             kernels.gather(values, nodes, buffer)
+        self._fence()
         self._start(requests)
         self.seconds["pack"] += time.perf_counter() - begin
 
@@ -157,6 +160,7 @@ class Halo:
         _, below, above, requests = self._turns[0]
         self._turns.reverse()
         self._wait(requests)
+        self._fence()
         waited = time.perf_counter()
         self._total[:] = 0
         for places, buffer in below:
@@ -180,6 +184,7 @@ class Halo:
                 request.Free()
         self._turns.clear()
         if self._window is not None:
+            self._window.Unlock_all()
             self._window.Free()
 
 
@@ -208,6 +213,7 @@ def _shared_buffers(world: World, buffers: dict[int, NDArray[np.floating]]) -> t
             begins[rank] = [end, end + size]
             end += 2 * size
     window = MPI.Win.Allocate_shared(end, 1, comm=host)
+    window.Lock_all(MPI.MODE_NOCHECK)  # which `Sync` asks for; nobody locks it otherwise
     of_all = dict(zip(ranks, host.allgather(begins), strict=True))
 
     def buffer(writer: int, reader: int, turn: int) -> NDArray[np.floating]:
