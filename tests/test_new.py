@@ -49,7 +49,7 @@ BRAIN = """
 image = "{image}"
 element_size = 6.0
 [tumour]
-centre = [-26.0, -70.0, 3.0]
+centre = [-32.0, -20.0, 10.0]
 volume = 4188.8
 [material.brain]
 youngs_modulus = 3000.0
@@ -69,8 +69,8 @@ MISTAKES = {
     "misspelt section": ("[tumour]", "[tumor]", "tumor", "did you mean tumour"),
     "volume in m3": ("4188.8", "4.1888e-6", "tumour.volume", "mm3; give more"),
     "negative volume": ("4188.8", "-4188.8", "tumour.volume = -4188.8", "above 0, in mm3"),
-    "centre outside of the head": ("[-26.0, -70.0", "[-26.0, -170.0", "tumour.centre", "mm"),
-    "seed in a ventricle": ("[-26.0, -70.0, 3.0]", "[-10.0, -20.0, 20.0]", "tumour.centre", "ventricle"),
+    "centre outside of the head": ("[-32.0, -20.0", "[-32.0, -170.0", "tumour.centre", "mm"),
+    "seed in a ventricle": ("[-32.0, -20.0, 10.0]", "[-10.0, -20.0, 20.0]", "tumour.centre", "ventricle"),
     "missing file": ("{image}", "no.nii.gz", "labels.image", "give a path relative to the deck"),
     "element size in metres": ("element_size = 6.0", "element_size = 0.006", "element_size", "mm"),
     "cells without a material": (', "right_ventricle"]', "]", "the first in right_ventricle", "name their set"),
