@@ -27,7 +27,7 @@ KEEP = 0.9
 SETTLED, STEADY = 50, 0.1
 #: `load_steps` = "auto": at most so much would a cell next to moved nodes be strained in a step, if nothing gave way;
 #: and the load takes no less than a shear wave across so many cells, for what keeps its volume has to flow.
-STRAIN_PER_STEP, SHEAR_CELLS = 0.1, 14
+STRAIN_PER_STEP, SHEAR_CELLS = 0.2, 14
 #: It has stalled when so many surveys in a row have not brought the least estimate down by this factor: round-off.
 STALLED, BETTER = 300, 0.99
 #: The least estimate counts for nothing when the lowest eigenvalue has fallen to this share of what it was then: a mode
