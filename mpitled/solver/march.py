@@ -161,12 +161,12 @@ class March:
             self.halo.sum(self.survey.required)
         required[self.prescribed] = 0
         if self.sharpness.due():
-            mass = required if self.scales_mass else s.mass
-            mobility = np.divide(1.0, mass, out=np.zeros_like(mass), where=mass > 0)[None]
-            bound = (2 * self.safety / s.time_step) ** 2
-            if not self.scales_mass:
+            mobility, bound = s.mobility, (2 * self.safety) ** 2
+            if self.scales_mass:
+                mobility = np.divide(s.time_step**2, required, out=np.zeros_like(required), where=required > 0)
+            else:
                 bound *= self._largest((required / s.mass).max())
-            self.sharpness.renew(s, mobility, bound)
+            self.sharpness.renew(s, mobility[None], bound)
         required *= self.sharpness.share
         return required
 

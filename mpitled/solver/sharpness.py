@@ -70,7 +70,7 @@ class Sharpness:
         """
         n, rows, iterations = self._sub.n_nodes, self._sub.rows, FIRST if self.mode is None else AGAIN
         trial = copy(s)
-        trial.seen, trial.f = s.seen.copy(), np.empty_like(s.f)
+        trial.f = np.empty_like(s.f)
         # Whatever it is, it is tried as it is: single precision is enough for it, and a checkpoint has it in double.
         mode = np.zeros((3, n), np.float32) if self.mode is None else self.mode.astype(np.float32, copy=False)
         self.mode = mode
@@ -80,9 +80,13 @@ class Sharpness:
         for iteration in range(iterations):
             if not 0 < size < math.inf:
                 return found
-            kernels.perturb(s.u, mode, self._reach / size, trial.seen)
+            # Tried in place and taken back, for a copy would be among the largest arrays of a run. What is left of it is
+            # round-off, the same on all ranks.
+            scale = self._reach / size
+            kernels.perturb(s.u, mode, scale, s.seen)
             trial.f[:] = 0
             self._take(trial)
+            kernels.perturb(s.u, mode, -scale if s.seen is s.u else 0.0, s.seen)
             # The mode becomes mobility times its response, so that the response times it is mode . M mode.
             sums = kernels.respond(mode, trial.f, s.f, mobility, self._free, rows.owned, self._reach, size)
             table = self._world.gather(sums)

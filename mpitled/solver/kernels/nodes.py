@@ -332,9 +332,12 @@ def stir(mode, nodes, free, share):  # type: ignore[no-untyped-def]
                 mode[c, n] += share * (np.float64(x >> np.uint64(11)) * 2.0**-53 - 0.5)
 
 
-@kernel
+@njit(cache=True)
 def perturb(u, mode, scale, seen):  # type: ignore[no-untyped-def]
-    """seen (3, :) <- u + scale mode, at the nodes of mode (3, n)."""
+    """seen (3, :) <- u + scale mode, at the nodes of mode (3, n).
+
+    Not of the fast kind, which rounds the sum alone: so what is put on no displacement can be taken off to the bit.
+    """
     for c in range(3):
         for n in range(U(mode.shape[1])):
             seen[c, n] = u[c, n] + scale * mode[c, n]
