@@ -80,8 +80,8 @@ class Sharpness:
         for iteration in range(iterations):
             if not 0 < size < math.inf:
                 return found
-            # Tried in place and taken back, for a copy would be among the largest arrays of a run. What is left of it is
-            # round-off, the same on all ranks.
+            # Tried in place and taken back, for a copy would be among the largest arrays of a run. Round-off remains of
+            # it, the same on all ranks.
             scale = self._reach / size
             kernels.perturb(s.u, mode, scale, s.seen)
             trial.f[:] = 0
