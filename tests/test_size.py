@@ -22,9 +22,9 @@ nodes = "z1"
 directions = ["z"]
 displacement = [-1.0]
 """
-#: Runs of some hundred steps, and what they may take by cell (measured: 156, 276). A step's arrays are 93 bytes (`mpitled
-#: bench`); the survey, the last good state, and the power iteration with its mode are the rest, and in relaxation the
-#: states that it goes back to and estimates from.
+#: Runs of some hundred steps, and what they may take by cell (measured: 156, 276). A step's arrays are 93 bytes
+#: (`mpitled bench`); the survey, the last good state, and the power iteration with its mode are the rest, and in
+#: relaxation the states that it goes back to and estimates from.
 RUNS = {
     "dynamic run": ("solver.method=dynamic", "solver.load_time=0.002"),
     "relaxation": ("solver.method=dynamic-relaxation", "solver.tolerance=0.5"),

@@ -1,13 +1,11 @@
-"""Steps of dynamic relaxation beside those of the ramps that end as near to the static solution.
+"""Steps of dynamic relaxation beside those of the shortest ramp that ends as near to the static solution.
 
 python jobs/validation/relaxation.py [FOLDER]   (out/relaxation)
 
 Relaxation ends by its own estimate, 0.01 mm. For the ramp `solver.load_time` is doubled or halved from a second until
-its distance from rest (`static_distance_mm`, which the run goes on to find) passes 0.01 mm, and then bisected: the
-shortest. What a ramp leaves of a mode's swing comes and goes with its length, so that this one is near by chance; the
-surely quasi-static one is the shortest from which on all are near that are tried, up to twice as long. Runs what has
-not been run yet, one after the other on one rank; goes on where it was stopped. Writes relaxation.csv in jobs/studies,
-and prints it as a table.
+its distance from rest (`static_distance_mm`, which the run goes on to find) passes 0.01 mm, and then bisected. Runs
+what has not been run yet, one after the other on one rank; goes on where it was stopped. Writes relaxation.csv in
+jobs/studies, and prints it as a table.
 """
 
 from __future__ import annotations
@@ -35,8 +33,8 @@ SCENES: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 NEAR = 0.01  # mm from the static solution
 ALWAYS = ("output.frames=1", "output.pictures=false")
-#: Load times are found to this factor, no longer ones than this (s) are tried, and longer ones in steps of this factor.
-CLOSE, LONGEST, STRIDE = 1.05, 16.0, 1.1
+#: Load times are found to this factor, and no longer ones than this (s) are tried.
+CLOSE, LONGEST = 1.05, 16.0
 
 
 def solved(folder: Path, deck: str, overrides: Sequence[str]) -> dict[str, Any]:
@@ -47,8 +45,8 @@ def solved(folder: Path, deck: str, overrides: Sequence[str]) -> dict[str, Any]:
     return {} if failure else dict(json.loads((folder / "report.json").read_text()))
 
 
-def ramps(out: Path, deck: str, overrides: Sequence[str]) -> tuple[Path | None, Path | None]:
-    """Folders of the shortest ramp that ends near, and of the shortest from which on all do."""
+def shortest_ramp(out: Path, deck: str, overrides: Sequence[str]) -> tuple[float, Path | None, Path | None]:
+    """Load time (s) of the shortest ramp that ends near, its folder, and that of the next shorter one tried."""
     tried: dict[float, Path] = {}
 
     def near(load_time: float) -> bool:
@@ -63,59 +61,57 @@ def ramps(out: Path, deck: str, overrides: Sequence[str]) -> tuple[Path | None, 
     else:
         while not near(high := 2 * high):
             if high >= LONGEST:
-                return None, None
+                return high, None, tried[high]
     low = high / 2
     while high / low > CLOSE:
         middle = float(np.sqrt(low * high))
         low, high = (low, middle) if near(middle) else (middle, high)
-    sure = longer = high
-    while (longer := longer * STRIDE) <= 2 * sure:
-        if longer > LONGEST:
-            return tried[high], None
-        if not near(longer):
-            sure = longer * STRIDE
-    return tried[high], tried[sure]
+    return high, tried[high], tried[low]
 
 
 def row(name: str, out: Path) -> dict[str, Any]:
-    """What relaxation and the ramps of a scene took, and how far apart they are at the nodes."""
+    """What relaxation and the ramp of a scene took, and how far apart they are at the nodes."""
     deck, overrides = SCENES[name]
     relaxing = ("solver.method=dynamic-relaxation", f"solver.tolerance={NEAR}")
     relaxed = solved(out / "relaxation", deck, (*overrides, *relaxing))
+    load_time, ramp, shorter = shortest_ramp(out, deck, overrides)
     found: dict[str, Any] = {
         "scene": name,
         "steps": relaxed["steps"],
         "static_distance_mm": relaxed["static_distance_mm"],
+        "ramp_load_time_s": load_time,
     }
-    ours = field.open_field(out / "relaxation").at_nodes
-    for kind, folder in zip(("shortest", "sure"), ramps(out, deck, overrides), strict=True):
-        if folder is not None:
-            report = solved(folder, deck, ())
-            theirs = field.open_field(folder).at_nodes
-            found |= {
-                f"{kind}_steps": report["steps"],
-                f"{kind}_load_time_s": folder.name.removeprefix("ramp-"),
-                f"{kind}_static_distance_mm": report["static_distance_mm"],
-                f"{kind}_share": relaxed["steps"] / report["steps"],
-                f"{kind}_apart_mm": 1e3 * float(np.linalg.norm(ours - theirs, axis=1).max()),
-            }
+    if ramp is not None:
+        report = solved(ramp, deck, ())
+        found |= {"ramp_steps": report["steps"], "ramp_static_distance_mm": report["static_distance_mm"]}
+        ours, theirs = (field.open_field(folder).at_nodes for folder in (out / "relaxation", ramp))
+        found |= {
+            "share_of_steps": relaxed["steps"] / report["steps"],
+            "apart_mm": 1e3 * float(np.linalg.norm(ours - theirs, axis=1).max()),
+        }
+    if shorter is not None:
+        less = solved(shorter, deck, ())
+        found |= {"shorter_steps": less.get("steps"), "shorter_static_distance_mm": less.get("static_distance_mm")}
     return found
 
 
 def markdown(rows: Sequence[dict[str, Any]]) -> str:
-    """The table; a ramp that is not near at the longest load has no numbers."""
+    """The table; a ramp that fails or is too far from rest at the longest load has no steps."""
     lines = [
-        "| scene | relaxation, steps | from rest, mm | sure ramp, steps | from rest, mm | share | apart, mm "
-        "| shortest ramp, steps | share |",
-        "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
+        "| scene | relaxation, steps | from rest, mm | ramp, steps | from rest, mm | share | apart, mm |",
+        "|---|---:|---:|---:|---:|---:|---:|",
     ]
-    forms = {
-        "steps": ",", "static_distance_mm": ".4f", "sure_steps": ",", "sure_static_distance_mm": ".4f",
-        "sure_share": ".2f", "sure_apart_mm": ".4f", "shortest_steps": ",", "shortest_share": ".2f",
-    }  # fmt: skip
     for found in rows:
-        cells = (format(found[key], form) if key in found else "" for key, form in forms.items())
-        lines.append(f"| {found['scene']} | {' | '.join(cells)} |")
+        head = f"| {found['scene']} | {found['steps']:,} | {found['static_distance_mm']:.4f} |"
+        if "ramp_steps" in found:
+            lines.append(
+                f"{head} {found['ramp_steps']:,} | {found['ramp_static_distance_mm']:.4f} | "
+                f"{found['share_of_steps']:.2f} | {found['apart_mm']:.4f} |"
+            )
+        else:
+            steps, distance = found.get("shorter_steps"), found.get("shorter_static_distance_mm")
+            tried = f"more than {steps:,} | {distance:.4f}" if steps and distance else "none | "
+            lines.append(f"{head} {tried} | | |")
     return "\n".join(lines)
 
 
