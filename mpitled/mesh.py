@@ -46,6 +46,16 @@ class Constraint:
 
 
 @dataclass(frozen=True, slots=True)
+class Part:
+    """The cloud of one material: a body of its own, which shares the nodes of its surface with those beside it."""
+
+    spheres: tuple[str, ...]  # those that it lies in
+    integration_points: NDArray[np.int64]  # ascending
+    nodes: NDArray[np.int64]  # in it and on its surface, ascending
+    areas: NDArray[np.float64]  # (nodes, 3), m^2: integral of N_a n over its surface but the seed's; 0 of an only part
+
+
+@dataclass(frozen=True, slots=True)
 class Mesh:
     """Nodes, hexahedra and integration points in metres; FE nodes first, then EFG nodes (paper, 4.1.2).
 
@@ -62,6 +72,7 @@ class Mesh:
     node_ids: NDArray[np.int64]  # (n_nodes,), numbers in the file that the nodes came from
     # (n_nodes, 3), m^2: integral of N_a n over the outer surface, at nodes on the cloud's boundary; None: unknown.
     surface_areas: NDArray[np.float64] | None = None
+    parts: tuple[Part, ...] = ()  # of the cloud, where it is known
     materials: dict[str, Material] = field(default_factory=dict)  # cell set -> material, where the file says so
     constraints: tuple[Constraint, ...] = ()  # where the file says so
     remarks: tuple[str, ...] = ()  # what the reader skipped, merged or repaired, a line each

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled.deck import Deck
+from mpitled.deck import Deck, Sphere
 from mpitled.errors import InputError
 from mpitled.loading import growth, turn
 from mpitled.material import Material
-from mpitled.mesh import Mesh, named_set
+from mpitled.mesh import Mesh, Part, named_set
 from mpitled.meshing import block, checks, labels, phantoms
+from mpitled.meshing.cloud import in_sphere
 from mpitled.meshing.mapping import carry_over
 from mpitled.model import Model
 from mpitled.solver import hexahedra, support
@@ -30,26 +31,37 @@ def read_mesh(deck: Deck) -> Mesh:
         return mesh
     middles = np.concatenate([mesh.points[mesh.hexahedra].mean(axis=1), mesh.integration_points])
     cell_sets = dict(mesh.cell_sets)
+    apart = _bounding(deck)
     for sphere in deck.spheres:
         origin = f"{deck.path}: sphere.{sphere.name}"
         if sphere.name in cell_sets:
             raise InputError(f"{origin}: there is a cell set of that name already; give it another")
-        inside = np.flatnonzero(np.linalg.norm(middles - np.asarray(sphere.centre), axis=1) <= sphere.radius)
-        if not len(inside):
+        inside = in_sphere(middles, sphere)
+        for part in mesh.parts if sphere in apart else ():
+            inside[len(mesh.hexahedra) + part.integration_points] = sphere.name in part.spheres
+        if not inside.any():
             raise InputError(f"{origin}: no cell has its middle in it; move or enlarge it, or make the cells smaller")
-        cell_sets[sphere.name] = inside
+        cell_sets[sphere.name] = np.flatnonzero(inside)
     return replace(mesh, cell_sets=cell_sets)
 
 
+def _bounding(deck: Deck) -> list[Sphere]:
+    """The spheres whose cells are of another material than those around them."""
+    filled = {name for section in deck.materials for name in section.cells if len(deck.materials) > 1}
+    return [sphere for sphere in deck.spheres if sphere.name in filled]
+
+
 def _geometry(deck: Deck) -> Mesh:
+    spheres = _bounding(deck)
     if deck.labels:
-        return labels.mesh_labels(deck.labels, deck.cloud, deck.tumour)
+        return labels.mesh_labels(deck.labels, deck.cloud, deck.tumour, spheres)
     if deck.block:
-        return block.block_mesh(deck.block, deck.cloud, deck.tumour, deck.spheres)
+        fitted = next((sphere for sphere in deck.spheres if sphere.name == deck.block.fitted), None)
+        return block.block_mesh(deck.block, deck.cloud, deck.tumour, fitted, spheres)
     if deck.cylinder:
-        return phantoms.cylinder_mesh(deck.cylinder, deck.cloud, deck.tumour)
+        return phantoms.cylinder_mesh(deck.cylinder, deck.cloud, deck.tumour, spheres)
     if deck.ellipsoid:
-        return phantoms.ellipsoid_mesh(deck.ellipsoid, deck.cloud, deck.tumour)
+        return phantoms.ellipsoid_mesh(deck.ellipsoid, deck.cloud, deck.tumour, spheres)
     assert deck.mesh is not None  # load_deck sees to exactly one geometry
     from mpitled.readers import meshes
 
@@ -67,12 +79,10 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
     options = deck.support
     material, materials = _materials(deck, mesh)
     at, volumes, n_hexahedra = mesh.integration_points, mesh.integration_volumes, len(mesh.hexahedra)
-    limits, wanted = _limits(deck, mesh)
-    found = support.find_domains(mesh.points, at, options.nodes, limits, wanted, options.min_domains)
-    repaired = support.repair(mesh.points, at, found.domains, options.basis, options.weight, limits)
+    domains, found = _domains(deck, mesh, material)
     # Only now: repair can take a node from its last domain. FE nodes stay, for they have mass from hexahedra.
-    orphans = np.setdiff1d(np.arange(mesh.n_fe_nodes, mesh.n_nodes), found.domains)
-    mesh, domains = _without(orphans, mesh, found.domains)
+    orphans = np.setdiff1d(np.arange(mesh.n_fe_nodes, mesh.n_nodes), domains)
+    mesh, domains = _without(orphans, mesh, domains)
     uncoupled = np.setdiff1d(_members(mesh, "interface"), domains)
     if len(uncoupled):
         raise InputError(
@@ -87,12 +97,9 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
     fe_gradients, fe_volumes = hexahedra.geometry(points, mesh.hexahedra, deck.hexahedra.gradient)
     figures = dict(mesh.figures)
     if options.consistency and len(domains):
-        balance = hexahedra.nodal_sum(mesh.hexahedra, fe_volumes[:, None, None] * fe_gradients, len(points))
-        free, surface = _surface(mesh, balance, dofs // 3)
-        free &= np.bincount(domains.ravel(), minlength=len(points)) > 0
-        balance = balance - surface
-        gradients, corrected = support.correct_consistency(points[domains], domains, gradients, volumes, balance, free)
-        figures |= corrected
+        fe_balance = hexahedra.nodal_sum(mesh.hexahedra, fe_volumes[:, None, None] * fe_gradients, len(points))
+        gradients, of_correction = _consistent(mesh, domains, gradients, fe_balance, dofs // 3)
+        figures |= of_correction
 
     lam, mu, density = (np.array([getattr(m, name) for m in materials])[material] for name in ("lam", "mu", "density"))
     cell_mass = density * np.concatenate([hexahedra.volumes(points, mesh.hexahedra), volumes])
@@ -108,14 +115,11 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
     critical = critical[loose] if len(loose) else critical
     # Next to a seed the cloud is fine: a few heavier nodes there cost less than its short step everywhere.
     in_cloud = np.isin(loose, domains) if len(loose) else np.zeros(len(points), bool)
-    figures |= {
+    figures |= found | {
         "critical_step_typical_s": float(np.median(critical if in_cloud.all() else critical[~in_cloud])),
         "mass_kg": float(cell_mass.sum()),
         "volume_m3": float(fe_volumes.sum() + volumes.sum()),
-        "domains_limited": found.limited,
-        "memberships_added": found.added,
         "orphans_removed": len(orphans),
-        "domains_repaired": repaired,
         "worst_condition": float(condition.max()) if len(condition) else 1.0,
     }
     return Model(
@@ -142,6 +146,86 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
         figures=figures,
         remarks=(*mesh.remarks, *checks.scene_remarks(points, mesh.hexahedra, domains, n_fe_nodes, dofs)),
     )
+
+
+def _domains(deck: Deck, mesh: Mesh, material: NDArray[np.int16]) -> tuple[NDArray[np.int64], dict[str, float]]:
+    """Nodes (n_integration, n) of the support domains, and figures of how they were found.
+
+    A domain takes its nodes from its own part of the cloud, and from hexahedra of its own material: a fit across the
+    interface would smear the kink that displacements have there (Belytschko, Krysl and Krongauz 1996; Cordes and Moran
+    1996). A part with too few nodes takes of all.
+    """
+    options, at, n_hexahedra = deck.support, mesh.integration_points, len(mesh.hexahedra)
+    limits, wanted = _limits(deck, mesh)
+    of_parts = []
+    names = ("domains_limited", "memberships_added", "domains_repaired", "domains_across")
+    figures: dict[str, float] = dict.fromkeys(names, 0)
+    for part in _parts(mesh):
+        own = np.unique(material[n_hexahedra + part.integration_points])
+        held = np.zeros(mesh.n_nodes, bool)
+        held[part.nodes] = True
+        may = held.copy()
+        may[mesh.hexahedra[np.isin(material[:n_hexahedra], own)]] = True
+        for nodes in (np.flatnonzero(may), np.arange(mesh.n_nodes)):
+            points, places = mesh.points[nodes], at[part.integration_points]
+            some = [(members[nodes], most) for members, most in limits]
+            try:
+                found = support.find_domains(
+                    points, places, options.nodes, some, (wanted & held)[nodes], options.min_domains
+                )
+                repaired = support.repair(points, places, found.domains, options.basis, options.weight, some)
+                break
+            except InputError:
+                if len(nodes) == mesh.n_nodes:
+                    raise
+        of_parts.append((part.integration_points, nodes[found.domains]))
+        across = not may[nodes].all()
+        counts = (found.limited, found.added, repaired, across * len(places))
+        figures = {name: before + count for (name, before), count in zip(figures.items(), counts, strict=True)}
+    domains = np.empty((len(at), options.nodes), np.int64)
+    for points_of_part, own_domains in of_parts:
+        domains[points_of_part] = own_domains
+    return domains, figures
+
+
+def _parts(mesh: Mesh) -> tuple[Part, ...]:
+    """The parts of the cloud; one that may take all nodes where nobody knows of which material they are."""
+    points = np.arange(len(mesh.integration_points))
+    if mesh.parts or not len(points):
+        return mesh.parts
+    nodes = np.arange(mesh.n_nodes)
+    if mesh.surface_areas is not None:  # the cloud is known
+        nodes = np.union1d(nodes[mesh.n_fe_nodes :], _members(mesh, "interface"))
+    return (Part((), points, nodes, np.zeros((len(nodes), 3))),)
+
+
+def _consistent(
+    mesh: Mesh,
+    domains: NDArray[np.int64],
+    gradients: NDArray[np.float64],
+    fe_balance: NDArray[np.float64],
+    prescribed: NDArray[np.int64],
+) -> tuple[NDArray[np.float64], dict[str, float]]:
+    """Gradients with which constant stress is in balance in each part of the cloud, and the worst part's figures.
+
+    In each and not in the whole only: the stress jumps from part to part. What is the same on both sides, the traction,
+    is in balance where each part's gradients sum to the interface's areas. fe_balance is the hexahedra's sum of V B.
+    """
+    known, surface = _surface(mesh, fe_balance, prescribed)
+    volumes = mesh.integration_volumes
+    if len(mesh.parts) < 2:
+        free = known & (np.bincount(domains.ravel(), minlength=mesh.n_nodes) > 0)
+        nodes = mesh.points[domains]
+        return support.correct_consistency(nodes, domains, gradients, volumes, fe_balance - surface, free)
+    corrected, figures = np.empty_like(gradients), dict[str, float]()
+    for part in mesh.parts:
+        rows, balance = part.integration_points, np.zeros_like(surface)
+        balance[part.nodes] = -part.areas
+        own, nodes = domains[rows], mesh.points[domains[rows]]
+        free = known & (np.bincount(own.ravel(), minlength=mesh.n_nodes) > 0)
+        corrected[rows], found = support.correct_consistency(nodes, own, gradients[rows], volumes[rows], balance, free)
+        figures = {name: max(value, figures.get(name, 0.0)) for name, value in found.items()}
+    return corrected, figures
 
 
 def _limits(deck: Deck, mesh: Mesh) -> tuple[list[support.Limit], NDArray[np.bool_]]:
@@ -250,6 +334,10 @@ def _without(orphans: NDArray[np.int64], mesh: Mesh, domains: NDArray[np.int64])
         values = tuple(v[there] if isinstance(v, np.ndarray) else v for v in given.displacement)
         if there.any():
             constraints.append(replace(given, displacement=values))
+    parts = []
+    for part in mesh.parts:
+        there = keep[part.nodes]
+        parts.append(replace(part, nodes=number[part.nodes[there]], areas=part.areas[there]))
     remark = f"{len(orphans)} EFG nodes that are in no support domain removed"
     kept = replace(
         mesh,
@@ -258,6 +346,7 @@ def _without(orphans: NDArray[np.int64], mesh: Mesh, domains: NDArray[np.int64])
         node_sets=sets,
         constraints=tuple(constraints),
         surface_areas=None if mesh.surface_areas is None else mesh.surface_areas[keep],
+        parts=tuple(parts),
         remarks=(*mesh.remarks, remark),
     )
     return kept, number[domains]

@@ -139,7 +139,7 @@ def test_block_is_fitted_to_a_sphere(where):
     errors = []
     for n in (4, 8):
         block = deck.Block(size=(0.03, 0.03, 0.03), elements=(n, n, n), fitted="cyst")
-        mesh = block_mesh(block, CLOUD, None, [sphere])
+        mesh = block_mesh(block, CLOUD, None, sphere)
         assert fe_volume(mesh) == pytest.approx(0.03**3, rel=1e-12)
         assert hexahedra.scaled_jacobian(mesh.points, mesh.hexahedra).min() > 0.3
         inside = np.linalg.norm(mesh.points[mesh.hexahedra].mean(axis=1) - centre, axis=1) < sphere.radius
@@ -148,22 +148,30 @@ def test_block_is_fitted_to_a_sphere(where):
     assert 0 < errors[1] < errors[0] < 0.1
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
     with pytest.raises(InputError, match=r"block.fitted: the sphere cyst .* does not lie in the block"):
-        block_mesh(block, CLOUD, None, [dataclasses.replace(sphere, radius=0.04)])
+        block_mesh(block, CLOUD, None, dataclasses.replace(sphere, radius=0.04))
 
 
 def test_sphere_of_cells(tmp_path):
-    """Hexahedra and integration points by their middles; what cannot be is said by its key."""
+    """By middles of hexahedra, replaced ones for the cloud; what cannot be is said by its key."""
     path = tmp_path / "scene.toml"
     text = '[block]\nsize = [40, 40, 40]\nelements = [8, 8, 8]\ncloud = "core"\n[[fixed]]\nnodes = "x0"\n' + MATERIAL
     cyst = "[sphere.cyst]\ncentre = [12, 20, 20]\nradius = 10\n"
     cyst += '[material.fluid]\nyoungs_modulus = 10\npoissons_ratio = 0.1\ncells = ["cyst"]\n'
     path.write_text(text + cyst)
     mesh, model = (of(deck.load_deck(path)) for of in (preprocess.read_mesh, preprocess.build))
-    middles = np.concatenate([mesh.points[mesh.hexahedra].mean(axis=1), mesh.integration_points])
+    places = np.concatenate([mesh.points[mesh.hexahedra].mean(axis=1), mesh.integration_points])
+    middles = 0.005 * (np.floor(places / 0.005) + 0.5)
     inside = np.linalg.norm(middles - [0.012, 0.02, 0.02], axis=1) <= 0.01
     assert 0 < inside[: len(mesh.hexahedra)].sum() < inside.sum() < len(middles)
     np.testing.assert_array_equal(np.flatnonzero(inside), mesh.cell_sets["cyst"])
     np.testing.assert_array_equal([model.materials[m].name for m in model.material], np.where(inside, "fluid", "brain"))
+    # A sphere of no other material divides nothing, and takes each integration point by itself.
+    path.write_text(text + cyst.partition("[material")[0])
+    undivided = preprocess.read_mesh(deck.load_deck(path))
+    assert len(undivided.parts) == 1 < len(mesh.parts)
+    places = np.concatenate([undivided.points[undivided.hexahedra].mean(axis=1), undivided.integration_points])
+    inside = np.linalg.norm(places - [0.012, 0.02, 0.02], axis=1) <= 0.01
+    np.testing.assert_array_equal(np.flatnonzero(inside), undivided.cell_sets["cyst"])
     for before, after, message in (
         ("radius = 10", "radius = 0.1", r"sphere.cyst: no cell has its middle in it"),
         ("sphere.cyst", "sphere.all", r"sphere.all: there is a cell set of that name"),

@@ -21,13 +21,17 @@ _NEAR = 1e-9
 
 
 def block_mesh(
-    block: deck.Block, cloud: deck.Cloud, tumour: deck.Tumour | None, spheres: Sequence[deck.Sphere] = ()
+    block: deck.Block,
+    cloud: deck.Cloud,
+    tumour: deck.Tumour | None,
+    fitted: deck.Sphere | None = None,
+    spheres: Sequence[deck.Sphere] = (),
 ) -> Mesh:
     """The mesh of a block with its faces as node sets x0, x1, y0, y1, z0, z1 and, together, surface.
 
     A core cloud takes about `core_share` of the hexahedra along each side, in the middle or, where they are fitted to a
-    sphere, around it; with a tumour, those within `cloud.radius` of its centre. Raises InputError for a tumour without
-    a cloud, or for a tumour or sphere without room.
+    sphere, around it; with a tumour, those within `cloud.radius` of its centre. `spheres` divide the cloud in parts.
+    Raises InputError for a tumour without a cloud, or for a tumour or sphere without room.
     """
     if tumour is not None and block.cloud == "none":
         raise InputError('block.cloud = "none": a tumour grows in a cloud; set it to "core" or "all"')
@@ -38,7 +42,6 @@ def block_mesh(
         check_size(float(wanted.prod()), "cloud.spacing")
         shape = wanted.astype(np.int64)
     check_size(float(np.prod(shape, dtype=float)), "block.elements")
-    fitted = next((sphere for sphere in spheres if sphere.name == block.fitted), None)
     if fitted:
         places, hexahedra, core = _fitted(size, shape, np.asarray(fitted.centre) - corner, fitted, block.core_share)
     else:
@@ -64,7 +67,7 @@ def block_mesh(
         middle = corner + places[hexahedra].mean(axis=1)
         dropped = np.linalg.norm(middle - np.asarray(tumour.centre), axis=1) <= cloud.radius
     element_size = float((size.prod() / len(hexahedra)) ** (1 / 3))
-    return with_cloud(corner + places, hexahedra, dropped, node_sets, cloud, tumour, element_size)
+    return with_cloud(corner + places, hexahedra, dropped, node_sets, cloud, tumour, element_size, spheres)
 
 
 def _inner(shape: NDArray[np.int64], share: float) -> NDArray[np.bool_]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from mpitled import room
 from mpitled.errors import InputError
-from mpitled.mesh import CORNERS, Mesh, numbered_mesh
+from mpitled.mesh import CORNERS, Mesh, Part, numbered_mesh
 from mpitled.solver.hexahedra import geometry, nodal_sum
 
 if TYPE_CHECKING:
@@ -79,6 +80,7 @@ class Filling:
     interface: NDArray[np.int64]  # FE nodes on the void's boundary, ascending
     seed_nodes: NDArray[np.int64]  # EFG nodes on the seed's surface, ascending
     surface_areas: NDArray[np.float64]  # (n_nodes, 3), m^2: see `Mesh`
+    parts: tuple[Part, ...]  # see `Mesh`
     spacing: Spacing
     figures: dict[str, float]
 
@@ -95,13 +97,15 @@ def fill_void(
     cloud: deck.Cloud,
     tumour: deck.Tumour | None,
     element_size: float,
+    spheres: Sequence[deck.Sphere] = (),
 ) -> Filling:
     """Replaces the dropped (n_hexahedra,) of hexahedra (n, 8) with nodes `points` (n, 3), m, by a cloud.
 
     Hexahedra may have any shape: integration cells are cut through their trilinear maps, so that the volumes sum
     to the void's (less the seed's) exactly. Nodes on the outer surface that no hexahedron uses any more become
-    EFG nodes; so a cloud without hexahedra ends on the given surface. `element_size` (m) is the largest spacing
-    unless the deck gives one. The same arguments give the same bits.
+    EFG nodes; so a cloud without hexahedra ends on the given surface. So do nodes of faces between hexahedra inside and
+    outside one of the spheres, where the cloud has two parts. `element_size` (m) is the largest spacing unless
+    the deck gives one. The same arguments give the same bits.
 
     Raises InputError if nothing is dropped, if no node fits in, or if the seed does not lie inside the void.
     """
@@ -117,38 +121,54 @@ def fill_void(
     _check_size(corners, void, spacing, cloud.points_per_spacing)
     in_fe = np.zeros(len(points), bool)
     in_fe[hexahedra[~dropped]] = True
+    within, of_part = _parts(corners.mean(axis=1), spheres)
+    pieces = [hexahedra[dropped][of_part == p] for p in range(len(within))]
+    faces = [boundary] if len(pieces) == 1 else [boundary_faces(piece) for piece in pieces]
     on_boundary = np.zeros(len(points), bool)
-    on_boundary[boundary] = True
+    on_boundary[np.concatenate(faces)] = True
     kept = np.concatenate([np.flatnonzero(in_fe), np.flatnonzero(on_boundary & ~in_fe)])
     new_numbers = np.full(len(points), -1)
     new_numbers[kept] = np.arange(len(kept))
 
     occupied = np.concatenate([points[on_boundary], seed])
-    inner = scatter(corners, spacing, occupied, cloud.irregularity, np.random.default_rng([cloud.seed, 0]))
-    cells = cut(corners, spacing, cloud.points_per_spacing, np.random.default_rng([cloud.seed, 1]))
-    volumes, centroids = volumes_and_centroids(cells)
+    for_nodes, for_cells = (np.random.default_rng([cloud.seed, stream]) for stream in (0, 1))
+    inner = [scatter(points[piece], spacing, occupied, cloud.irregularity, for_nodes) for piece in pieces]
+    cells = [cut(points[piece], spacing, cloud.points_per_spacing, for_cells) for piece in pieces]
+    volumes, centroids = volumes_and_centroids(np.concatenate(cells))
+    of_point = np.repeat(np.arange(len(cells)), [*map(len, cells)])
     figures = {"void_volume_m3": void, "seed_volume_m3": 0.0}
     if tumour is not None:
-        volumes, centroids, sampled = _outside(cells, volumes, centroids, spacing)
+        volumes, centroids, sampled, left = _outside(np.concatenate(cells), volumes, centroids, spacing)
+        of_point = of_point[left]
         figures["seed_volume_m3"] = _ball(spacing.radius)
         figures["integration_volume_before_rescaling_m3"] = sampled
 
     # The mean gradients' sum over all hexahedra of a node is the outer surface's share of it.
-    around = hexahedra[on_boundary[hexahedra].any(axis=1)]
-    gradients, weights = geometry(points, around)
-    areas = nodal_sum(around, weights[:, None, None] * gradients, len(points))
-    areas[~on_boundary] = 0.0
-    new_areas = np.zeros((len(kept) + len(seed) + len(inner), 3))
+    areas = _areas(points, hexahedra, on_boundary)
+    new_areas = np.zeros((len(kept) + len(seed) + sum(map(len, inner)), 3))
     new_areas[: len(kept)] = areas[kept]
+    # The seed's nodes are of the parts that they touch.
+    ends = np.cumsum([len(kept) + len(seed), *map(len, inner)])
+    touched = of_point[cKDTree(centroids).query(seed, k=[1, 2, 3, 4])[1]]
+    parts = []
+    for p in np.unique(of_point):
+        hull = np.unique(faces[p])
+        of_seed = len(kept) + np.flatnonzero((touched == p).any(axis=1))
+        nodes = np.concatenate([new_numbers[hull], of_seed, np.arange(ends[p], ends[p + 1])])
+        of_hull = np.zeros((len(nodes), 3))
+        if len(pieces) > 1:
+            of_hull[: len(hull)] = _areas(points, pieces[p], on_boundary)[hull]
+        order = np.argsort(nodes)
+        parts.append(Part(within[p], np.flatnonzero(of_point == p), nodes[order], of_hull[order]))
 
-    n_efg = np.count_nonzero(on_boundary & ~in_fe) + len(seed) + len(inner)
+    n_efg = np.count_nonzero(on_boundary & ~in_fe) + len(seed) + sum(map(len, inner))
     if n_efg == 0:
         raise InputError(
             "cloud: no node fits into the hexahedra that it replaces; replace more, or lower cloud.spacing"
         )
     figures["integration_points_per_efg_node"] = float(len(volumes) / n_efg)
     return Filling(
-        points=np.concatenate([points[kept], seed, inner]),
+        points=np.concatenate([points[kept], seed, *inner]),
         n_fe_nodes=int(in_fe.sum()),
         hexahedra=new_numbers[hexahedra[~dropped]],
         new_numbers=new_numbers,
@@ -157,6 +177,7 @@ def fill_void(
         interface=new_numbers[on_boundary & in_fe],
         seed_nodes=np.arange(len(kept), len(kept) + len(seed)),
         surface_areas=new_areas,
+        parts=tuple(parts),
         spacing=spacing,
         figures=figures,
     )
@@ -170,13 +191,14 @@ def with_cloud(
     cloud: deck.Cloud,
     tumour: deck.Tumour | None,
     element_size: float,
+    spheres: Sequence[deck.Sphere] = (),
 ) -> Mesh:
     """The mesh with a cloud in place of the dropped hexahedra (see `fill_void`), with sets interface and tumour."""
-    filling = fill_void(points, hexahedra, dropped, cloud, tumour, element_size)
+    filling = fill_void(points, hexahedra, dropped, cloud, tumour, element_size, spheres)
     node_sets = {name: filling.renumber(nodes) for name, nodes in node_sets.items()} | {"interface": filling.interface}
     if tumour is not None:
         node_sets["tumour"] = filling.seed_nodes
-    return numbered_mesh(
+    mesh = numbered_mesh(
         filling.points,
         filling.n_fe_nodes,
         filling.hexahedra,
@@ -186,6 +208,33 @@ def with_cloud(
         filling.figures,
         filling.surface_areas,
     )
+    return replace(mesh, parts=filling.parts)
+
+
+def in_sphere(places: NDArray[np.float64], sphere: deck.Sphere) -> NDArray[np.bool_]:
+    """Which of places (n, 3), m, lie in it."""
+    return np.asarray(np.linalg.norm(places - np.asarray(sphere.centre), axis=1) <= sphere.radius)
+
+
+def _parts(
+    middles: NDArray[np.float64], spheres: Sequence[deck.Sphere]
+) -> tuple[list[tuple[str, ...]], NDArray[np.int64]]:
+    """Names of the spheres in which the parts of the cloud lie, and the part (n,) of hexahedra with middles (n, 3)."""
+    inside = np.zeros((len(middles), len(spheres)), bool)
+    for i, sphere in enumerate(spheres):
+        inside[:, i] = in_sphere(middles, sphere)
+    kinds, of_part = np.unique(inside, axis=0, return_inverse=True)
+    names = [tuple(s.name for s, held in zip(spheres, kind, strict=True) if held) for kind in kinds]
+    return names, of_part.ravel()
+
+
+def _areas(points: NDArray[np.float64], hexahedra: NDArray[np.int64], at: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Integral of N_a n over the surface of hexahedra, (n_points, 3) in m^2, at the chosen nodes, 0 elsewhere."""
+    around = hexahedra[at[hexahedra].any(axis=1)]
+    gradients, weights = geometry(points, around)
+    areas = nodal_sum(around, weights[:, None, None] * gradients, len(points))
+    areas[~at] = 0.0
+    return areas
 
 
 def boundary_faces(hexahedra: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -406,8 +455,9 @@ def _cuts(ratio: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.in
 
 def _outside(
     cells: NDArray[np.float64], volumes: NDArray[np.float64], centroids: NDArray[np.float64], spacing: Spacing
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Volumes and centroids of what lies outside the seed of cells (n, 8, 3), and their sum before it is made exact.
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float, NDArray[np.int64]]:
+    """Volumes and centroids of what lies outside the seed of cells (n, 8, 3), their sum before it is made exact, and
+    which cells they are of.
 
     Cells that the sphere cuts are sampled. Slivers are merged into the nearest point. The sampling error of the
     sum is spread over the cut cells.
@@ -443,7 +493,7 @@ def _outside(
     assert spacing.centre is not None
     stretch = np.maximum(1.0, spacing.radius / spacing.distance(centroids))
     centroids += (stretch - 1)[:, None] * (centroids - spacing.centre)
-    return volumes[kept], centroids, float(sampled)
+    return volumes[kept], centroids, float(sampled), kept
 
 
 def _candidates(cells: NDArray[np.float64], spacing: Spacing, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from mpitled import room
 from mpitled.errors import InputError
-from mpitled.mesh import CORNERS, Mesh, check_size
+from mpitled.mesh import CORNERS, Mesh, Part, check_size
 from mpitled.meshing.cloud import fill_void, in_millimetres
 
 if TYPE_CHECKING:
@@ -81,7 +81,9 @@ class Head:
     remarks: tuple[str, ...]
 
 
-def mesh_labels(labels: deck.Labels, cloud: deck.Cloud, tumour: deck.Tumour | None) -> Mesh:
+def mesh_labels(
+    labels: deck.Labels, cloud: deck.Cloud, tumour: deck.Tumour | None, spheres: Sequence[deck.Sphere] = ()
+) -> Mesh:
     """The mesh of a label image: one face-connected solid of cubes without non-manifold edges or vertices.
 
     Each label keeps its volume. No ventricle touches the outer surface, each is one face-connected piece. With a
@@ -96,9 +98,10 @@ def mesh_labels(labels: deck.Labels, cloud: deck.Cloud, tumour: deck.Tumour | No
     node_sets["skull"] = np.flatnonzero(np.bincount(hexahedra.ravel()) < 8)
     figures, n_fe_nodes = head.figures, len(points)
     integration_points, integration_volumes, surface_areas = np.empty((0, 3)), np.empty(0), None
+    parts: tuple[Part, ...] = ()
     if tumour is not None:
         void = _void(head, cloud.radius, np.asarray(tumour.centre, float))
-        filling = fill_void(points, hexahedra, void[head.solid], cloud, tumour, head.grid.size)
+        filling = fill_void(points, hexahedra, void[head.solid], cloud, tumour, head.grid.size, spheres)
         points, hexahedra, n_fe_nodes = filling.points, filling.hexahedra, filling.n_fe_nodes
         integration_points, integration_volumes = filling.integration_points, filling.integration_volumes
         node_sets = {name: filling.renumber(nodes) for name, nodes in node_sets.items()}
@@ -106,7 +109,7 @@ def mesh_labels(labels: deck.Labels, cloud: deck.Cloud, tumour: deck.Tumour | No
         cell_sets = {name: np.flatnonzero(cells[head.solid & ~void]) for name, cells in head.parts.items()}
         cell_sets["tissue"] = np.append(cell_sets["tissue"], len(hexahedra) + np.arange(len(integration_volumes)))
         figures = figures | filling.figures
-        surface_areas = filling.surface_areas
+        surface_areas, parts = filling.surface_areas, filling.parts
     cell_sets["all"] = np.arange(len(hexahedra) + len(integration_volumes))
     return Mesh(
         points=points,
@@ -118,6 +121,7 @@ def mesh_labels(labels: deck.Labels, cloud: deck.Cloud, tumour: deck.Tumour | No
         cell_sets=cell_sets,
         node_ids=np.arange(1, len(points) + 1),
         surface_areas=surface_areas,
+        parts=parts,
         remarks=head.remarks,
         figures=figures,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,7 +24,9 @@ _TIE = 1e-9
 _THICK = 1.5
 
 
-def cylinder_mesh(cylinder: deck.Cylinder, cloud: deck.Cloud, tumour: deck.Tumour | None) -> Mesh:
+def cylinder_mesh(
+    cylinder: deck.Cylinder, cloud: deck.Cloud, tumour: deck.Tumour | None, spheres: Sequence[deck.Sphere] = ()
+) -> Mesh:
     """The mesh of a cylinder along z from z = 0, a square core in rings: sets bottom, top, side and, together, surface.
 
     A core cloud ends at the ring or layer next to `core_share` of radius and height, or, with a tumour, takes the
@@ -51,10 +54,12 @@ def cylinder_mesh(cylinder: deck.Cylinder, cloud: deck.Cloud, tumour: deck.Tumou
     inside = np.abs(share[1:] + share[:-1] - 1) < cylinder.core_share - _TIE
     inside[[0, -1]] = False
     core = (inside[:, None] & onion.core(cylinder.core_share)).ravel()
-    return _filled(cylinder.cloud, core, points, hexahedra, node_sets, cloud, tumour, size)
+    return _filled(cylinder.cloud, core, points, hexahedra, node_sets, cloud, tumour, size, spheres)
 
 
-def ellipsoid_mesh(ellipsoid: deck.Ellipsoid, cloud: deck.Cloud, tumour: deck.Tumour | None) -> Mesh:
+def ellipsoid_mesh(
+    ellipsoid: deck.Ellipsoid, cloud: deck.Cloud, tumour: deck.Tumour | None, spheres: Sequence[deck.Sphere] = ()
+) -> Mesh:
     """The mesh of an ellipsoid around the origin: a cube-like core in shells of an equiangular cubed sphere.
 
     Sets are surface and, where with (p, q, r) = (x/a, y/b, z/c) on it r > 0, |p| <= t r, |q| <= t r, t = tan(pi/8),
@@ -82,7 +87,7 @@ def ellipsoid_mesh(ellipsoid: deck.Ellipsoid, cloud: deck.Cloud, tumour: deck.Tu
     points = axes * onion.points
     if tumour is None or ellipsoid.cloud != "none":
         core = onion.core(ellipsoid.core_share)
-        return _filled(ellipsoid.cloud, core, points, onion.cells, node_sets, cloud, tumour, size)
+        return _filled(ellipsoid.cloud, core, points, onion.cells, node_sets, cloud, tumour, size, spheres)
     _check_room(tumour, axes, size)
     if ellipsoid.cavity == "moved":
         return _moved(points, onion.cells, node_sets, axes, np.asarray(tumour.centre))
@@ -103,6 +108,7 @@ def _filled(
     cloud: deck.Cloud,
     tumour: deck.Tumour | None,
     element_size: float,
+    spheres: Sequence[deck.Sphere],
 ) -> Mesh:
     """The mesh with the cloud that the deck asks for: "none", "core" or "all"."""
     if which == "none":
@@ -113,7 +119,7 @@ def _filled(
         dropped = core
     else:
         dropped = np.linalg.norm(points[hexahedra].mean(axis=1) - np.asarray(tumour.centre), axis=1) <= cloud.radius
-    return with_cloud(points, hexahedra, dropped, node_sets, cloud, tumour, element_size)
+    return with_cloud(points, hexahedra, dropped, node_sets, cloud, tumour, element_size, spheres)
 
 
 def _check_room(tumour: deck.Tumour, axes: NDArray[np.float64], element_size: float) -> None:

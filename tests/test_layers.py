@@ -1,0 +1,167 @@
+"""Clouds of several materials: domains keep to their own, so that a strain with a kink at the interface is exact."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import mpitled
+from test_kernels import HOURGLASS, at, forces, part
+
+from mpitled import deck, store
+from mpitled.batch.exact import layers
+from mpitled.errors import InputError
+from mpitled.preprocess import build, discretise, read_mesh
+from mpitled.results import field
+from mpitled.solver.subdomain import localise
+
+EPS = np.finfo(float).eps
+CONTRAST = 1000.0
+#: The upper half is of another material: a sphere so large that no hexahedron is cut by what it bends.
+LAYERS = """
+[block]
+size = [32.0, 28.0, 24.0]
+elements = [8, 7, 6]
+cloud = "{cloud}"
+core_share = 0.7
+[cloud]
+irregularity = {irregularity} # where the cloud is all, it would move the interface's nodes on the surface
+[sphere.upper]
+centre = [16.0, 14.0, 1012.0]
+radius = 1000.0
+[material.lower]
+youngs_modulus = 3000.0
+poissons_ratio = 0.49
+[material.upper]
+youngs_modulus = {modulus}
+poissons_ratio = 0.3
+cells = ["upper"]
+[[displaced]]
+nodes = "z1"
+directions = ["z"]
+displacement = [2.4]
+[solver]
+tolerance = 1e-5
+[output]
+frames = 1
+""" + "".join(f'[[fixed]]\nnodes = "{face}"\ndirections = ["{face[0]}"]\n' for face in ("x0", "x1", "y0", "y1", "z0"))
+
+
+def text_of(cloud, contrast=CONTRAST):
+    return LAYERS.format(cloud=cloud, modulus=3000.0 * contrast, irregularity=0.0 if cloud == "all" else 0.3)
+
+
+def deck_of(folder, cloud, contrast=CONTRAST, more=""):
+    path = folder / "layers.toml"
+    path.write_text(text_of(cloud, contrast) + more)
+    return path
+
+
+def residual(model):
+    """Largest force off the surface in the layers' exact deformation, as a share of the largest on the surface."""
+    rows = part(
+        model.points, model.hexahedra, model.domains, model.domain_gradients, model.domain_volumes, model.material
+    )
+    sub = localise(replace(rows, materials=model.materials), HOURGLASS, 0.1, "mean")
+    f = forces(sub, at(sub, layers(model, model.points, 0.0)))
+    inner = np.ones(model.n_nodes, bool)
+    inner[model.node_sets["surface"]] = False
+    assert inner.sum() > 100
+    return np.abs(f[inner]).max() / np.abs(f).max()
+
+
+@pytest.mark.parametrize("contrast", [CONTRAST, 1 / CONTRAST])
+@pytest.mark.parametrize("cloud", ["none", "core", "all"])
+@pytest.mark.parametrize("support", ["", "nodes = 12", "basis = 10\nnodes = 24"])
+def test_layers_are_exact_to_round_off(tmp_path, cloud, contrast, support):
+    """Each layer is strained alike, a thousand times less in the stiffer: all nodes off the surface are in balance."""
+    scene = deck.load_deck(deck_of(tmp_path, cloud, contrast, f"[support]\n{support}\n"))
+    mesh = read_mesh(scene)
+    model = discretise(scene, mesh)
+    # The patch test's bound (test_support), and the stiffer layer's stress is a difference of ones.
+    assert residual(model) < 18 * 20 * EPS * 49 * CONTRAST
+    if cloud != "none":
+        assert model.figures["domains_across"] == 0
+        assert model.figures["consistency_after"] < 100 * EPS
+        smeared = discretise(scene, replace(mesh, parts=(), surface_areas=None))
+        assert residual(smeared) > 1e-2
+
+
+@pytest.mark.parametrize("cloud", ["core", "all"])
+def test_domains_keep_to_their_material(tmp_path, cloud):
+    """Nodes of a domain are on its own side or on the interface, and the interface's are in domains of both."""
+    scene = deck.load_deck(deck_of(tmp_path, cloud))
+    mesh = read_mesh(scene)
+    model = discretise(scene, mesh)
+    middle, z = 0.012, model.points[:, 2]
+    upper = model.material[len(model.hexahedra) :] == 1
+    np.testing.assert_array_equal(upper, model.domain_points[:, 2] > middle)
+    assert z[model.domains[upper]].min() == middle == z[model.domains[~upper]].max()
+    between = np.intersect1d(*(part.nodes for part in mesh.parts))
+    assert len(between) == {"core": 7 * 6, "all": 9 * 8}[cloud]
+    for side in (upper, ~upper):
+        counts = np.bincount(model.domains[side].ravel(), minlength=model.n_nodes)
+        assert counts[between].min() >= 3
+
+
+def test_parts_of_a_cloud_have_their_surfaces(tmp_path):
+    """Areas of a closed surface sum to nothing, and with the places to the part's volume; nodes keep their distance."""
+    mesh = read_mesh(deck.load_deck(deck_of(tmp_path, "core")))
+    assert [sorted(p.spheres) for p in mesh.parts] == [[], ["upper"]]
+    for one in mesh.parts:
+        size = np.abs(one.areas).sum()
+        assert np.abs(one.areas.sum(axis=0)).max() < 10 * EPS * size
+        volume = mesh.integration_volumes[one.integration_points].sum()
+        np.testing.assert_allclose(mesh.points[one.nodes].T @ one.areas, volume * np.eye(3), atol=1e-12 * volume)
+    points = np.concatenate([one.integration_points for one in mesh.parts])
+    np.testing.assert_array_equal(np.sort(points), np.arange(len(mesh.integration_points)))
+    shared = np.intersect1d(*(one.nodes for one in mesh.parts))
+    np.testing.assert_array_equal(np.unique(mesh.points[shared, 2]), [0.012])
+    assert np.isin(np.arange(mesh.n_fe_nodes, mesh.n_nodes), np.concatenate([p.nodes for p in mesh.parts])).all()
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_layers_come_to_rest_where_they_should(tmp_path, n):
+    path = deck_of(tmp_path, "core", 100.0)
+    mpitled("run", path, "--out", tmp_path / "run", n=n)
+    ours = field.open_field(tmp_path / "run")
+    model = store.read_model(tmp_path / "run" / "model.h5")
+    true = layers(model, model.points, 0.0)
+    # What relaxation leaves, by its own bound.
+    assert np.abs(ours.at_nodes - true).max() < 1e-7
+    middles = model.points[model.hexahedra].mean(axis=1)
+    assert np.abs(ours.at(middles).displacement - layers(model, middles, 0.0)).max() < 1e-7
+
+
+def test_a_layer_with_too_few_nodes_takes_of_all(tmp_path):
+    """One layer of two by two hexahedra has 18 nodes and perhaps one within, of which no 24 can be had."""
+    text = text_of("all", 0.01).replace("[8, 7, 6]", "[2, 2, 6]").replace("1012.0", "1020.0")
+    path = tmp_path / "thin.toml"
+    path.write_text(text + "[support]\nnodes = 24\nmax_fe_nodes = 24\n")
+    model = build(deck.load_deck(path))
+    upper = model.material == 1
+    assert model.figures["domains_across"] == upper.sum() > 0
+    assert model.points[model.domains[~upper]][..., 2].max() == 0.02
+    assert (np.bincount(model.domains.ravel(), minlength=model.n_nodes) >= 2).all()
+    path.write_text(text + "[support]\nnodes = 100\nmax_fe_nodes = 100\n")
+    with pytest.raises(InputError, match=r"support\.nodes = 100: is more than the .* nodes that there are"):
+        build(deck.load_deck(path))
+
+
+def test_spheres_apart_are_parts_that_share_nothing(tmp_path):
+    """Two spheres, one of them in the middle of the cloud and one in hexahedra and cloud, and the rest around."""
+    more = "".join(
+        f"[sphere.{name}]\ncentre = [{x}, 14, 6]\nradius = 4\n[material.{name}]\nyoungs_modulus = {modulus}\n"
+        f'poissons_ratio = 0.1\ncells = ["{name}"]\n'
+        for name, x, modulus in (("soft", 14, 30.0), ("hard", 24, 3e5))
+    )
+    path = deck_of(tmp_path, "core", more=more)
+    mesh = read_mesh(deck.load_deck(path))
+    model = build(deck.load_deck(path))
+    assert sorted(one.spheres for one in mesh.parts) == [(), ("hard",), ("soft",), ("upper",)]
+    names = np.array([material.name for material in model.materials])[model.material]
+    for one in mesh.parts:
+        inside = names[len(model.hexahedra) + one.integration_points]
+        assert set(inside) == set(one.spheres or ("lower",))
+    assert model.figures["consistency_after"] < 100 * EPS
