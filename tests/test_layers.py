@@ -12,6 +12,8 @@ from test_kernels import HOURGLASS, at, forces, part
 from mpitled import deck, store
 from mpitled.batch.exact import layers
 from mpitled.errors import InputError
+from mpitled.mesh import grid_points, structured_hexahedra
+from mpitled.meshing.cloud import CLOSEST, fill_void, volumes_and_centroids
 from mpitled.preprocess import build, discretise, read_mesh
 from mpitled.results import field
 from mpitled.solver.subdomain import localise
@@ -165,3 +167,24 @@ def test_spheres_apart_are_parts_that_share_nothing(tmp_path):
         inside = names[len(model.hexahedra) + one.integration_points]
         assert set(inside) == set(one.spheres or ("lower",))
     assert model.figures["consistency_after"] < 100 * EPS
+
+
+def test_a_cloud_is_as_fine_as_the_interface(tmp_path):
+    """Hexahedra that are finer on one side of the block: next to the interface nodes lie as densely as its faces."""
+    points, hexahedra = grid_points((12, 12, 8), (0.024, 0.024, 0.032)), structured_hexahedra((12, 12, 8))
+    sphere = deck.Sphere(name="upper", centre=(0.012, 0.012, 1.016), radius=1.0)
+    dropped = np.ones(len(hexahedra), bool)
+    coarse, fine = (
+        fill_void(points, hexahedra, dropped, deck.Cloud(), None, 0.004, spheres) for spheres in ((), (sphere,))
+    )
+    assert len(coarse.parts) == 1
+    inside = [(np.abs(f.points - [0.012, 0.012, 0.016]) < [0.01, 0.01, 0.004]).all(axis=1) for f in (coarse, fine)]
+    volume = 0.02 * 0.02 * 0.008
+    assert inside[0].sum() < 0.5 * volume / 0.002**3
+    assert inside[1].sum() == pytest.approx(volume / 0.002**3, rel=0.3)
+    middles = (points[:12] + points[14:26]) / 2 + [0, 0, 0.016]
+    np.testing.assert_allclose(fine.spacing(middles), 0.002, rtol=1e-9)
+    scattered = fine.points[-len(fine.points) // 4 :]
+    away = np.linalg.norm(scattered[:, None] - scattered, axis=2) + np.eye(len(scattered))
+    assert (away.min(axis=1) >= CLOSEST * fine.spacing(scattered) * (1 - 1e-12)).all()
+    assert fine.integration_volumes.sum() == pytest.approx(volumes_and_centroids(points[hexahedra])[0].sum(), rel=1e-12)
