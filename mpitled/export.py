@@ -1,7 +1,8 @@
 """A model as decks: Abaqus files of the FE mesh and of the cloud, integration points as CSV, and the scene as TOML.
 
 Numbers are in SI units and the shortest decimals that are read as the same floats, in the model's order of nodes and
-cells: so what is read back is the same model, bit for bit.
+cells: so what is read back is the same model, bit for bit. But for a cloud of several materials: the decks do not say
+whose its nodes are, and support domains made from them take nodes of all. The scene says so.
 """
 
 from __future__ import annotations
@@ -237,6 +238,8 @@ def _quoted(name: str) -> str:
 def _scene(model: Model, scene: dict[str, Any], files: Sequence[str]) -> Iterator[str]:
     """The deck that the model was built from, with these files in place of its geometry."""
     yield "# Written by mpitled export. Fixed and displaced nodes are in the files of [mesh]; rotations are here too.\n"
+    if model.figures.get("cloud_parts", 0) > 1:
+        yield "# In the model each support domain has nodes of its own material only; made from these files, of any.\n"
     yield from (f"{key} = {toml.value(value)}\n" for key, value in scene.items() if not isinstance(value, dict | list))
     yield "\n[mesh]\n"
     for key, name in (("fe", FE), ("efg", EFG), ("integration_points", GRID), ("surface_areas", AREAS)):

@@ -119,6 +119,7 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
         "critical_step_typical_s": float(np.median(critical if in_cloud.all() else critical[~in_cloud])),
         "mass_kg": float(cell_mass.sum()),
         "volume_m3": float(fe_volumes.sum() + volumes.sum()),
+        "cloud_parts": len(mesh.parts),
         "orphans_removed": len(orphans),
         "worst_condition": float(condition.max()) if len(condition) else 1.0,
     }

@@ -136,6 +136,15 @@ def test_layers_come_to_rest_where_they_should(tmp_path, n):
     assert np.abs(ours.at(middles).displacement - layers(model, middles, 0.0)).max() < 1e-7
 
 
+def test_an_export_says_that_domains_will_be_others(tmp_path):
+    for cloud, says in (("all", True), ("none", False)):
+        mpitled("build", deck_of(tmp_path, cloud), "--out", tmp_path / cloud)
+        mpitled("export", tmp_path / cloud, "--abaqus", "--out", tmp_path / "decks")
+        text = (tmp_path / "decks" / "scene.toml").read_text()
+        assert ("nodes of its own material only" in text) == says
+        assert deck.load_deck(tmp_path / "decks" / "scene.toml").mesh is not None
+
+
 def test_a_layer_with_too_few_nodes_takes_of_all(tmp_path):
     """One layer of two by two hexahedra has 18 nodes and perhaps one within, of which no 24 can be had."""
     text = text_of("all", 0.01).replace("[8, 7, 6]", "[2, 2, 6]").replace("1012.0", "1020.0")
