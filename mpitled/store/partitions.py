@@ -73,10 +73,15 @@ def partition_mark(path: Path, n_parts: int) -> str:
 
 #: Rows first to last of a column, in the part's order.
 Source = Callable[[str, int, int], NDArray[Any]]
-_OF_NODES = ("node_ids", "rows", "points", "mass")
-_OF_HEXAHEDRA = ("hexahedra",)
-_OF_DOMAINS = ("domains", "domain_points", "domain_volumes", "domain_gradients", "domain_shapes")
-_OF_CELLS = ("cells", "material")
+#: What each long column has a row of.
+_COLUMNS = {
+    **dict.fromkeys(("node_ids", "rows", "points", "mass"), "nodes"),
+    **dict.fromkeys(("cells", "material"), "cells"),
+    "hexahedra": "hexahedra",
+    **dict.fromkeys(("domains", "domain_points", "domain_volumes", "domain_gradients", "domain_shapes"), "domains"),
+}
+#: Rows of long columns at a time.
+BLOCK = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,11 +128,13 @@ class PartRows:
 
     def length(self, name: str) -> int:
         """Rows of a column."""
-        if name in _OF_NODES:
-            return len(self.nodes)
-        return {_OF_HEXAHEDRA: self.n_own_hexahedra, _OF_DOMAINS: self.n_own_domains, _OF_CELLS: self.n_own_cells}[
-            next(names for names in (_OF_HEXAHEDRA, _OF_DOMAINS, _OF_CELLS) if name in names)
-        ]
+        lengths = {
+            "nodes": len(self.nodes),
+            "cells": self.n_own_cells,
+            "hexahedra": self.n_own_hexahedra,
+            "domains": self.n_own_domains,
+        }
+        return lengths[_COLUMNS[name]]
 
     def read(self, name: str, first: int = 0, last: int | None = None) -> NDArray[Any]:
         """Rows first to last of a long column, from the file. InputError if it cannot be read any more."""
@@ -146,10 +153,6 @@ class PartRows:
             return columns[name][first:last] if name in columns else self.source(name, first, last)
 
         return replace(self, source=source)
-
-
-#: Rows of long columns at a time.
-BLOCK = 1 << 16
 
 
 class _File:
@@ -172,16 +175,14 @@ class _File:
 
     def __call__(self, name: str, first: int, last: int) -> NDArray[Any]:
         with damaged(self._path, REBUILD):
-            if name in _OF_NODES:
-                if self._group is not None:
-                    return read_rows((self._group if name == "rows" else self._file)[name], self._nodes[first:last])
-                return np.arange(first, last) if name == "rows" else np.asarray(self._file[name][first:last])
             if name == "cells":
                 return self.numbers(first, last)
             if self._group is None:
-                return np.asarray(self._file[name][first:last])
-            if name in _OF_DOMAINS:
-                before = self.n_own_hexahedra
+                return np.arange(first, last) if name == "rows" else np.asarray(self._file[name][first:last])
+            kind, before = _COLUMNS[name], self.n_own_hexahedra
+            if kind == "nodes":
+                return read_rows((self._group if name == "rows" else self._file)[name], self._nodes[first:last])
+            if kind == "domains":
                 return read_rows(self._file[name], self.numbers(before + first, before + last) - self._n_hexahedra)
             return read_rows(self._file[name], self.numbers(first, last))
 
@@ -263,7 +264,7 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
 
 def _check_columns(part: PartRows) -> None:
     """ValueError unless the long columns hold what they may."""
-    for name in (*_OF_NODES, *_OF_CELLS, *_OF_HEXAHEDRA, *_OF_DOMAINS):
+    for name in _COLUMNS:
         for _, values in part.blocks(name):
             if name in ("hexahedra", "domains"):
                 # As `localise` will find them: a node of which this part has no copy would be beyond its arrays.
