@@ -137,6 +137,8 @@ class Run:
             series=_SERIES,
             frames=self.frames,
         )
+        if self.force_halo is not None:  # what was spent before the loop is not the loop's
+            self.force_halo.seconds = dict.fromkeys(self.force_halo.seconds, 0.0)
         begin = time.perf_counter()
         self._ask_again()
         _log.info("loop")

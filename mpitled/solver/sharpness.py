@@ -19,11 +19,10 @@ from mpitled.solver.memory import Kept
 from mpitled.solver.step import State, Term
 from mpitled.solver.subdomain import Subdomain
 
-#: Most iterations from a random start, and from the last eigenvector; and the growth of Rayleigh's quotient in one at
-#: which they end. It grows towards the eigenvalue: what is missing is left to `solver.safety`, 0.64 of the eigenvalue.
+#: Most iterations at first, and later; and the growth of Rayleigh's quotient in one at which they end. It grows towards
+#: the eigenvalue: what is missing is left to `solver.safety`, 0.64 of the eigenvalue. Each time they begin at random:
+#: from the last eigenvector a mode that comes up elsewhere, as next to a growing seed, is found too late.
 FIRST, AGAIN, CONVERGED = 60, 15, 1.01
-#: Share of randomness added to the last eigenvector, for a mode that was not there before.
-NOISE = 0.3
 #: What is found is rounded up to a power of this, so that ranks summed in another order find the same.
 RUNG = 1.02
 #: Surveys from one power iteration to the next where nothing changes; where the share grew by more than GROWS, one.
@@ -33,12 +32,11 @@ SELDOM, GROWS = 5, 1.05
 class Sharpness:
     """Power iteration on K = df/du in the present configuration, on all ranks; all of its calls are collective."""
 
-    LASTING = Kept(nodes=("mode",), alike=("share", "wait"))
+    LASTING = Kept(alike=("share", "wait"))
 
     def __init__(self, sub: Subdomain, world: World, forces: tuple[Term, ...], free: NDArray[np.bool_]) -> None:
         """free (3, n_nodes): see `Subdomain.free`."""
         self._sub, self._world, self._forces, self._free = sub, world, forces, free
-        self.mode: NDArray[np.floating] | None = None  # (3, n_nodes), the last eigenvector
         self.share = 0.0  # of the bound, that the operator has had at most
         self.wait = 0  # surveys until it is looked for again
         spread = float(np.ptp(sub.rows.read("points"), axis=0).max()) if sub.n_nodes else 0.0
@@ -68,16 +66,12 @@ class Sharpness:
         s has the forces of its displacements. mobility, s^2/kg: (1, n_nodes), or symmetric tensors (6, n_nodes); 0
         where it does not matter.
         """
-        n, rows, iterations = self._sub.n_nodes, self._sub.rows, FIRST if self.mode is None else AGAIN
-        trial = copy(s)
+        rows, trial = self._sub.rows, copy(s)
         trial.f = np.empty_like(s.f)
-        # Whatever it is, it is tried as it is: single precision is enough for it, and a checkpoint has it in double.
-        mode = np.zeros((3, n), np.float32) if self.mode is None else self.mode.astype(np.float32, copy=False)
-        self.mode = mode
-        kernels.stir(mode, rows.nodes, self._free, NOISE if mode.any() else 1.0)
-        size, weight = self._largest(np.abs(mode).max(initial=0.0)), 0.0
-        found = 0.0
-        for iteration in range(iterations):
+        mode = np.empty((3, self._sub.n_nodes), np.float32)  # whatever it is, it is tried as it is
+        kernels.scramble(mode, rows.nodes, self._free)
+        size, weight, found = self._largest(np.abs(mode).max(initial=0.0)), 0.0, 0.0
+        for iteration in range(AGAIN if self.share else FIRST):
             if not 0 < size < math.inf:
                 return found
             # Tried in place and taken back, for a copy would be among the largest arrays of a run. Round-off remains of
@@ -97,7 +91,6 @@ class Sharpness:
             if iteration > 2 and found < CONVERGED * last:
                 break
             weight = float(table[:, 1].sum()) / size**2 if size > 0 else 0.0
-        mode /= max(size, 1e-300)
         return float(RUNG ** math.ceil(math.log(found) / math.log(RUNG))) if found > 0 else 0.0
 
     def _largest(self, value: float) -> float:

@@ -135,7 +135,7 @@ def reasons(deck: Deck, sub: Subdomain, ranks: int) -> dict[str, str]:
         "add": alone,
         "add_gathered": alone,
         "scatter": alone,
-        **dict.fromkeys(("stir", "perturb", "respond"), ""),
+        **dict.fromkeys(("scramble", "perturb", "respond"), ""),
     }
 
 

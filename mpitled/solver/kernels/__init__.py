@@ -48,7 +48,7 @@ with _cached_by_source():
         relax,
         respond,
         scatter,
-        stir,
+        scramble,
         update,
         watch_relaxation,
     )  # fmt: skip
@@ -58,6 +58,6 @@ PADDING = BATCH_LANES  # the last vector of a run reads beyond the run's nodes, 
 __all__ = [
     "BATCH_LANES", "PADDING", "add", "add_gathered", "change_step", "domain_forces", "domain_survey", "follow",
     "gather", "hexahedron_forces", "hexahedron_survey", "invert_masses", "keep_masses", "kinetic_energy", "perturb",
-    "raise_mass", "react", "relax", "respond", "scatter", "stir", "update", "voxel_forces", "voxel_survey",
+    "raise_mass", "react", "relax", "respond", "scatter", "scramble", "update", "voxel_forces", "voxel_survey",
     "watch_relaxation",
 ]  # fmt: skip

@@ -317,19 +317,18 @@ def scatter(some, nodes, values):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def stir(mode, nodes, free, share):  # type: ignore[no-untyped-def]
-    """mode (3, n) += share times noise in [-0.5, 0.5) at free dofs, which belongs to the nodes' global numbers (n,).
+def scramble(mode, nodes, free):  # type: ignore[no-untyped-def]
+    """mode (3, n) <- numbers in [-0.5, 0.5) at free dofs, 0 at others; a hash of the nodes' global numbers (n,).
 
-    The noise is a hash of the dof's number (the end of splitmix64; Steele, Lea and Flood 2014): it takes no memory.
+    So they belong to the nodes, whatever rank these are on (the end of splitmix64; Steele, Lea and Flood 2014).
     """
     for c in range(3):
         for n in range(mode.shape[1]):
-            if free[c, n]:
-                x = np.uint64(3) * np.uint64(nodes[n]) + np.uint64(c) + np.uint64(0x9E3779B97F4A7C15)
-                x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-                x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-                x ^= x >> np.uint64(31)
-                mode[c, n] += share * (np.float64(x >> np.uint64(11)) * 2.0**-53 - 0.5)
+            x = np.uint64(3) * np.uint64(nodes[n]) + np.uint64(c) + np.uint64(0x9E3779B97F4A7C15)
+            x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+            x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+            x ^= x >> np.uint64(31)
+            mode[c, n] = np.float64(x >> np.uint64(11)) * 2.0**-53 - 0.5 if free[c, n] else 0.0
 
 
 @njit(cache=True)
