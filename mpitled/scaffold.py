@@ -33,7 +33,7 @@ nodes = "x0"
 _SCENES: Mapping[str, tuple[tuple[str, dict[str, Any]], ...]] = {
     "brain": (
         ("[labels]", {}),
-        ("[tumour]", {"centre": (-32.0, -20.0, 10.0), "volume": 4188.8}),
+        ("[tumour]", {"centre": (-32.0, -20.0, 10.0), "volume": 4188.8, "surface_nodes": 1600}),
         ("[material.brain]", _MATERIAL | {"cells": ("tissue",)}),
         (
             "[material.csf]",

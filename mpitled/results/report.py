@@ -164,9 +164,11 @@ def _warnings(report: Mapping[str, Any], ramped: bool) -> list[str]:
     if (error := report.get("volume_balance", {}).get("relative_error", 0.0)) > UNBALANCED:
         found.append(f"{error:.0%} of the grown volume is lost: refine the cloud around the tumour (cloud.growth)")
     if (misfit := report.get("cloud_misfit_mm", 0.0)) > FAR:
+        # Next to a grown seed the spacing on its surface decides, and a finer cloud behind it changes little.
+        keys = "raise tumour.surface_nodes" if "volume_balance" in report else "lower cloud.spacing"
         found.append(
             f"the cloud is too coarse for its field, which is uncertain by {misfit:.2g} mm at its worst node: refine "
-            "the cloud (cloud.growth, cloud.spacing)"
+            f"it there ({keys})"
         )
     if (distance := report.get("static_distance_mm", 0.0)) > FAR:
         found.append(
