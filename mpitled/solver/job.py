@@ -23,7 +23,7 @@ MODEL = "model.h5"
 DONE = "done"
 
 
-def build(deck: Deck, directory: Path) -> tuple[Path, bool]:
+def build(deck: Deck, directory: Path, quiet: bool = True) -> tuple[Path, bool]:
     """The model of a deck in directory/model.h5, and whether it had to be built: the same deck uses it again."""
     path = directory / MODEL
     key = decks.model_key(deck, included(deck))
@@ -39,6 +39,8 @@ def build(deck: Deck, directory: Path) -> tuple[Path, bool]:
         raise InputError(f"{directory}: cannot be made ({error.strerror}); give another folder with --out") from None
     from mpitled import preprocess  # only the rank that builds needs the meshers
 
+    if not quiet:
+        print("note: the model is built", file=sys.stderr, flush=True)
     store.write_model(path, preprocess.build(deck), key, decks.canonical(deck))
     return path, True
 
@@ -120,13 +122,13 @@ def prepare(
     """All that is done before the first step of `run`: model, partition, this rank's part, and the composed step."""
     phases = Phases()
     with phases("model"):
-        path = world.on_leader(lambda: build(deck, directory)[0])
+        path = world.on_leader(lambda: build(deck, directory, quiet)[0])
     if world.leads and not quiet:
         for remark in store.read_remarks(path):
             print(f"note: {remark}", file=sys.stderr, flush=True)
     with phases("partition"):
         if world.size > 1:
-            world.on_leader(lambda: ensure_partition(path, world.size, deck.partition.seed))
+            world.on_leader(lambda: ensure_partition(path, world.size, deck.partition.seed, quiet))
         mark = world.on_leader(lambda: store.partition_mark(path, world.size))
     with everywhere():
         if found and found.told["ranks"] == world.size and found.told["partition"] != mark:
@@ -146,7 +148,9 @@ def prepare(
         return Run(deck, directory, world, sub, figures, phases, quiet, about, found)
 
 
-def ensure_partition(path: Path, n_parts: int, seed: int) -> None:
+def ensure_partition(path: Path, n_parts: int, seed: int, quiet: bool = True) -> None:
     """Partition a model unless it is partitioned in as many parts."""
     if not store.has_partition(path, n_parts):
+        if not quiet:
+            print(f"note: the model is cut in {n_parts} parts", file=sys.stderr, flush=True)
         divide(path, n_parts, seed)
