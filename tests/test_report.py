@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -154,6 +155,20 @@ def test_volume_balance_of_an_incompressible_swelling(tmp_path):
     assert errors[1] < errors[0] / 2.5
 
 
+@pytest.mark.parametrize(
+    ("share", "words"), [(0.8, "of the grown volume is lost"), (1.2, "more volume is displaced than was grown")]
+)
+def test_volume_that_is_lost_is_told_from_volume_that_is_gained(tmp_path, share, words):
+    model = model_of(tmp_path, GROWTH, elements="12, 10, 10", cloud="core")
+    centre, radii = np.array([24e-3, 20e-3, 20e-3]), (2e-3, 3e-3)
+    tumour = {"centre_m": list(centre), "seed_radius_m": radii[0], "radius_m": radii[1]}
+    outcome = outcome_of(model, swell(centre, *radii), tumour)
+    made = report.compute(replace(outcome, field=share * outcome.field))
+    assert made["volume_balance"]["relative_error"] == pytest.approx(0.2, abs=0.02)
+    assert (report.unfound(made["volume_balance"]) > 0) == (share < 1)
+    assert any(words in warning for warning in made["warnings"])
+
+
 def test_enclosed_volume_is_that_of_the_hexahedra():
     """To round-off, for any motion: what the void gains, the hexahedra around it lose if their outside is held."""
     points, cells = grid_points((5, 5, 5), (0.05, 0.05, 0.05)), structured_hexahedra((5, 5, 5))
@@ -246,6 +261,20 @@ def test_scenes_without_a_tumour(tmp_path, cloud):
     assert not made.keys() & (OF_TUMOUR | OF_VENTRICLES)
     assert "tumour as reached" not in printed
     assert made["pictures"] == ["undeformed.png", "deformed.png"]
+
+
+def test_the_energies_of_relaxation_add_up(tmp_path):
+    (tmp_path / "scene.toml").write_text(SHEAR.format(cloud="none"))
+    method = "solver.method=dynamic-relaxation"
+    printed = mpitled("run", tmp_path / "scene.toml", "--set", method, "--out", tmp_path / "out").stdout
+    lines = dict(re.split(r"  +", line.strip(), maxsplit=1) for line in printed.splitlines() if line.startswith("  "))
+    external, taken, internal = (
+        float(lines[name].removesuffix(" J"))
+        for name in ("external work", "taken by damping, less what changed masses gave", "internal energy")
+    )
+    assert external - taken == pytest.approx(internal, rel=1e-3)
+    assert float(lines["from the static solution, by its own estimate"].removesuffix(" mm")) < 0.01
+    assert not {"time step", "kinetic/internal, largest after 10 %", "energy of added mass"} & lines.keys()
 
 
 def test_unfinished_results_without_figures(tmp_path):

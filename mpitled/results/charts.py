@@ -206,7 +206,7 @@ _ENERGIES = {
     "strain": "strain energy",
     "artificial": "hourglass control and stabilisation",
     "kinetic": "kinetic energy",
-    "taken": "taken by damping and changes of mass",
+    "taken": "taken by damping, less what changed masses gave",
 }
 
 

@@ -243,7 +243,8 @@ def _balance(run: _Run) -> Iterator[str]:
         "compression of the cloud": balance["elastic_compression_mm3"],
     }
     rows = [("added by the tumour", f"{grown:.1f}")] + [(name, f"{volume:.1f}") for name, volume in found.items()]
-    rows.append(("not found", f"{grown - sum(found.values()):.1f}"))
+    rest = report.unfound(balance)
+    rows.append(("not found", f"{rest:.1f}") if rest >= 0 else ("found beyond what was added", f"{-rest:.1f}"))
     yield markup.table(["volume", "mm\u00b3"], rows)
     if run.draws:
         from mpitled.results import charts
@@ -267,7 +268,8 @@ def _history(run: _Run) -> Iterator[str]:
         yield _picture(
             lambda to: charts.draw_history(run.times, run.series, label, to),
             "Three charts over the run: energies, kinetic over internal energy in %, and the smallest J",
-            f"At the {len(run.times)} frames that were written. J is the volume of a cell over its undeformed volume.",
+            f"At the {len(run.times)} frames that were written. J is the volume of a cell over its undeformed volume."
+            + " Masses are fictitious in relaxation, and so is kinetic energy." * run.relaxed,
         )
     series = run.series
     yield markup.hidden("The numbers, energies in J", _columns({label: run.times, **series}))

@@ -145,13 +145,19 @@ def compute(outcome: Outcome) -> dict[str, Any]:
     if outcome.centre is not None and len(outcome.seed):
         report |= _tumour(outcome, outcome.centre)
     report |= outcome.figures
-    solver = outcome.metadata.get("deck", {}).get("solver", {})
-    report["warnings"] = _warnings(report, solver.get("method") == "quasi-static")
+    if solver := outcome.metadata.get("deck", {}).get("solver"):
+        report["method"] = solver["method"]
+    report["warnings"] = _warnings(report)
     return report
 
 
-def _warnings(report: Mapping[str, Any], ramped: bool) -> list[str]:
-    """Why a result may not be what it seems, and the remedy; ramped: the run was quasi-static."""
+def unfound(balance: Mapping[str, float]) -> float:
+    """What of the added volume (mm^3) a volume balance did not find; below 0 if it found more."""
+    return balance["tumour_added_mm3"] - balance["pushed_through_interface_mm3"] - balance["elastic_compression_mm3"]
+
+
+def _warnings(report: Mapping[str, Any]) -> list[str]:
+    """Why a result may not be what it seems, and the remedy."""
     found = []
     energy = report.get("energy_J", {})
     if energy.get("internal", 0) > 0:
@@ -161,8 +167,10 @@ def _warnings(report: Mapping[str, Any], ramped: bool) -> list[str]:
                 f"{share:.0%} of the internal energy is in modes that no cell's strain sees, so the displacements are "
                 "not to be trusted: refine the mesh or the cloud, or raise support.stabilisation"
             )
-    if (error := report.get("volume_balance", {}).get("relative_error", 0.0)) > UNBALANCED:
-        found.append(f"{error:.0%} of the grown volume is lost: refine the cloud around the tumour (cloud.growth)")
+    balance = report.get("volume_balance", {})
+    if (error := balance.get("relative_error", 0.0)) > UNBALANCED:
+        wrong = "of the grown volume is lost" if unfound(balance) > 0 else "more volume is displaced than was grown"
+        found.append(f"{error:.0%} {wrong}: refine the cloud around the tumour (cloud.growth)")
     if (misfit := report.get("cloud_misfit_mm", 0.0)) > FAR:
         # Next to a grown seed the spacing on its surface decides, and a finer cloud behind it changes little.
         keys = "raise tumour.surface_nodes" if "volume_balance" in report else "lower cloud.spacing"
@@ -175,7 +183,7 @@ def _warnings(report: Mapping[str, Any], ramped: bool) -> list[str]:
             f"the ramp ended {distance:.2g} mm from the static solution: load more slowly (solver.load_time), or take "
             'solver.method = "dynamic-relaxation"'
         )
-    elif report["complete"] and ramped and "static_distance_mm" not in report:
+    elif report["complete"] and report.get("method") == "quasi-static" and "static_distance_mm" not in report:
         found.append(
             "how far the ramp ended from the static solution could not be found: load more slowly (solver.load_time), "
             'or take solver.method = "dynamic-relaxation"'
@@ -194,10 +202,10 @@ def table(report: Mapping[str, Any]) -> str:
     lines = [report["title"]] if report["title"] else []
     if not report["complete"]:
         lines.append(incomplete(report))
-    lines += [f"  {name:<40}  {value}" for name, value in rows(report)]
+    lines += [f"  {name:<47}  {value}" for name, value in rows(report)]
     lines += [f"  warning: {text}" for text in report["warnings"]]
     pictures = report["pictures"]
-    lines.append(f"  {'pictures':<40}  {', '.join(pictures) if isinstance(pictures, list) else pictures}")
+    lines.append(f"  {'pictures':<47}  {', '.join(pictures) if isinstance(pictures, list) else pictures}")
     return "\n".join(lines)
 
 
@@ -338,11 +346,13 @@ _LINES = (
     ("volume_balance.elastic_compression_mm3", "compression of the cloud", "{:.1f} mm3"),
     ("volume_balance.relative_error", "volume balance, error", "{:.2%}"),
     ("cloud_misfit_mm", "misfit of the cloud, largest", "{:.3f} mm"),
+    ("static_distance_mm", "from the static solution, by its own estimate", "{:.2g} mm"),
     ("min_jacobian", "smallest J", "{:.4f}"),
     ("energy_J.external", "external work", "{:.4g} J"),
     ("energy_J.internal", "internal energy", "{:.4g} J"),
     ("energy_J.kinetic", "kinetic energy", "{:.4g} J"),
     ("energy_J.added_mass", "energy of added mass", "{:.4g} J"),
+    ("energy_J.dissipated", "taken by damping, less what changed masses gave", "{:.4g} J"),
     ("energy_J.balance_error", "energy balance, error", "{:.2%}"),
     ("kinetic_to_internal.largest_after_10_percent", "kinetic/internal, largest after 10 %", "{:.2%}"),
     ("kinetic_to_internal.at_end", "kinetic/internal, at the end", "{:.2%}"),
@@ -356,11 +366,17 @@ _LINES = (
     ("imbalance", "imbalance of computing", "{:.1%}"),
     ("seconds", "wall time", "{:.1f} s"),
 )
+#: Lines of relaxation alone, and those that mean nothing there, where masses and time are fictitious.
+_OF_RELAXATION = {"energy_J.dissipated"}
+_OF_MARCHES = {"energy_J.added_mass", "kinetic_to_internal.largest_after_10_percent", "time_step_s"}
 
 
 def rows(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Name and value of each line of the table."""
+    foreign = _OF_MARCHES if report.get("method") == "dynamic-relaxation" else _OF_RELAXATION
     for key, name, form in _LINES:
+        if key in foreign:
+            continue
         value: Any = report
         for part in key.split("."):
             value = value.get(part) if isinstance(value, Mapping) else None
