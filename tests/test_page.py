@@ -82,6 +82,7 @@ def test_a_page_has_what_the_scene_has(brain, stopped):
     text, made = (brain / page.PAGE).read_text(), report.compute(report.read(brain))
     for value in (f"{made['ventricle_volume_change_ml']['left']:+.3f}", f"{made['tumour_volume_mm3']:.1f} mm"):
         assert value in text
+    assert "away from its centre, from a radius of 2 mm to " in text
     assert made["warnings"]
     for warning in made["warnings"]:
         assert warning in text

@@ -212,7 +212,7 @@ _ENERGIES = {
 
 def draw_history(times: NDArray[np.float64], series: Mapping[str, NDArray[np.float64]], label: str, path: _To) -> None:
     """Energies, kinetic over internal energy, and the smallest J of a run at its frames; label: of the time's axis."""
-    figure = Figure(figsize=(13, 4), layout="constrained")
+    figure = Figure(figsize=(13, 4.3), layout="constrained")
     FigureCanvasAgg(figure)
     energies, ratio, smallest = figure.subplots(1, 3)
     values = dict(series) | {"artificial": series["hourglass"] + series["stabilisation"]}
@@ -224,7 +224,7 @@ def draw_history(times: NDArray[np.float64], series: Mapping[str, NDArray[np.flo
     for i, (name, words) in enumerate(_ENERGIES.items(), 1):
         energies.plot(times, scale * values[name], label=words, color=_COLOURS[i], marker=_MARKERS[i], markersize=4)
     energies.set(xlabel=label, ylabel=f"energy ({unit})", title="energy")
-    energies.legend(fontsize=8)
+    figure.legend(loc="outside lower left", ncols=len(_ENERGIES), fontsize=8, frameon=False)
     percent = 100 * series["kinetic_ratio"]
     ratio.plot(times[percent > 0], percent[percent > 0], color=_COLOURS[4], marker=_MARKERS[4], markersize=4)
     ratio.set(xlabel=label, ylabel="kinetic over internal energy (%)", title="rest", yscale="log")

@@ -137,6 +137,9 @@ def _scene(run: _Run) -> Iterator[str]:
         caption="Materials",
     )  # fmt: skip
     held = [(of["nodes"], ", ".join(of["directions"]), "fixed") for of in deck.get("fixed", ())]
+    if tumour := run.outcome.metadata["tumour"]:
+        seed, full = (f"{1e3 * tumour[name]:.3g}" for name in ("seed_radius_m", "radius_m"))
+        held.append(("tumour", "x, y, z", f"away from its centre, from a radius of {seed} mm to {full} mm"))
     for of in deck.get("displaced", ()):
         moved = f"as in {of['field']}" if "field" in of else f"{toml.value(of['displacement'])} mm"
         turn = f", turned by {of['rotation']:g} degrees about {of['axis']}" if of["rotation"] else ""

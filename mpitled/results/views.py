@@ -180,6 +180,7 @@ _Paint = Callable[[Any, View, float], None]  # of matplotlib's axes, with a shar
 
 def _draw(directory: Path, path: Path, painter: Callable[[Solid], _Paint]) -> None:
     """A row for each view, before and after, with what the colours mean."""
+    from matplotlib import colormaps
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
@@ -204,6 +205,9 @@ def _draw(directory: Path, path: Path, painter: Callable[[Solid], _Paint]) -> No
         ScalarMappable(_norm(solid), MAP), ax=panels[:, 1], label="after: displacement (mm)", shrink=0.6, pad=0.02
     )
     shown = [Patch(facecolor=COLOURS[name], label=f"before: {name}") for name in parts(solid)]
+    if len(solid.tumour):  # its surface moves so far that it hardly looks coloured
+        moved = float(np.linalg.norm(solid.displacement[solid.tumour], axis=-1).mean())
+        shown.append(Patch(facecolor=colormaps[MAP](_norm(solid)(moved)), label="after: tumour"))
     figure.legend(handles=shown, loc="outside lower center", ncols=len(shown), frameon=False)
     figure.savefig(path, dpi=110)
 
