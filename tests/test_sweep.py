@@ -90,11 +90,11 @@ def test_tables_for_programs_and_for_people(tmp_path, groups):
     out, _ = groups
     beside = tmp_path / "by_hand.csv"
     beside.write_text("solver.load_steps,max_displacement_mm\n500,12.5\n")
-    assert "by hand" in mpitled("report", out, "--beside", beside, status=3).stdout
+    assert "by_hand.csv" in mpitled("report", out, "--beside", beside, status=3).stdout
     with h5py.File(out / "table.h5") as file:
         assert file["table/solver.load_steps"][:].tolist() == [400, 500, 1]
-        assert (file["table/error_estimate_mm"][:2] < 0.01).all()  # the tolerance of relaxation
-        assert np.isnan(file["table/error_estimate_mm"][2])
+        assert (file["table/static_distance_mm"][:2] < 0.01).all()  # the tolerance of relaxation
+        assert np.isnan(file["table/static_distance_mm"][2])
         assert [bool(text) for text in file["table/failure"].asstr()[:]] == [False, False, True]
         assert (file["times/whole_s"][:2] > file["times/loop_s"][:2]).all()
     lines = (out / "table.md").read_text().splitlines()
@@ -106,6 +106,27 @@ def test_tables_for_programs_and_for_people(tmp_path, groups):
     for name in ("quantities.png", "cost.png"):
         assert (out / name).stat().st_size > 10_000
     assert [record["case"] for record in open_sweep(out)] == [1, 2, 3]
+
+
+def test_a_table_says_which_cases_were_warned_of(tmp_path, groups):
+    out = shutil.copytree(groups[0], tmp_path / "out")
+    sweep = cases.read(out)
+    path = sweep.cases[1].folder / "report.json"
+    made = json.loads(path.read_text())
+    path.write_text(json.dumps(made | {"warnings": ["far from rest", "coarse"], "cloud_misfit_mm": 0.75}))
+    table = summary.collect(sweep)
+    summary.write(sweep, table)
+    words = "warning for solver.load_steps = 500: far from rest; coarse"
+    printed = summary.text(table).splitlines()
+    assert [line.endswith("*") for line in printed[-4:-2]] == [False, True]
+    assert "0.750" in printed[-3]
+    assert printed[-1] == words
+    assert (out / "table.md").read_text().endswith(f"\n\n- {words}\n")
+    assert words in (out / "table.html").read_text()
+    with (out / "table.csv").open() as file:
+        assert [row["warnings"] for row in csv.DictReader(file)] == ["", "far from rest; coarse", ""]
+    with h5py.File(out / "table.h5") as file:
+        assert file["table/warnings"].asstr()[1] == "far from rest; coarse"
 
 
 def test_an_array_job_computes_each_task_alone(tmp_path):

@@ -24,8 +24,8 @@ def tell(sweep: Sweep) -> None:
     """Write the reports of the cases that the run of the largest tumour, ended or broken, passed through.
 
     Between two frames the field is interpolated by the share of the growth, by which the tumour's surface moves
-    exactly so. What is known of the distance from a run of its own goes into the case's error estimate: that of the
-    whole run from rest at its end, and how far the interpolation may be wrong.
+    exactly so. What is known of the distance from a run of its own goes into the case's distance from the static
+    solution: that of the whole run at its end, and how far the interpolation may be wrong.
     """
     (run,) = sweep.runs
     todo = [case for case in sweep.cases if case is not run and case.failure != ""]

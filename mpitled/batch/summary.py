@@ -30,14 +30,15 @@ class _Column(NamedTuple):
 
 
 COLUMNS = (
-    _Column("left_ml", "ventricle_volume_change_ml.left", "left ventricle, ml", "{:+.3f}"),
-    _Column("right_ml", "ventricle_volume_change_ml.right", "right ventricle, ml", "{:+.3f}"),
-    _Column("total_ml", "ventricle_volume_change_ml.total", "ventricles, ml", "{:+.3f}"),
+    _Column("left_ml", "ventricle_volume_change_ml.left", "left ventricle, change, ml", "{:+.3f}"),
+    _Column("right_ml", "ventricle_volume_change_ml.right", "right ventricle, change, ml", "{:+.3f}"),
+    _Column("total_ml", "ventricle_volume_change_ml.total", "ventricles, change, ml", "{:+.3f}"),
     _Column("max_displacement_mm", "max_displacement_mm", "largest displacement, mm", "{:.2f}"),
     _Column("share_over_5mm_nodes", "share_over_5mm.nodes", "over 5 mm, share of nodes", "{:.2%}"),
     _Column("share_over_5mm_volume", "share_over_5mm.volume", "over 5 mm, share of volume", "{:.2%}"),
     _Column("min_jacobian", "min_jacobian", "smallest J", "{:.3f}"),
-    _Column("error_estimate_mm", "static_distance_mm", "error estimate, mm", "{:.4f}"),
+    _Column("static_distance_mm", "static_distance_mm", "from static solution, mm", "{:.4f}"),
+    _Column("cloud_misfit_mm", "cloud_misfit_mm", "misfit of cloud, mm", "{:.3f}"),
     _Column("volume_balance_error", "volume_balance.relative_error", "volume balance, error", "{:.2%}"),
     _Column("steps", "steps", "steps", "{:.0f}"),
     _Column("hexahedra", "cells.hexahedra", "hexahedra", "{:.0f}"),
@@ -48,15 +49,19 @@ TIMES = (
     _Column("loop_s", "seconds.loop", "loop, s", "{:.1f}"),
     _Column("whole_s", "seconds", "run time, s", "{:.1f}"),
 )
+#: People see a mark, and the words below the table.
+WARNINGS = _Column("warnings", "warnings", "warned", "{:.0}*")
 #: Numbers of the mesh are for the files, not for people.
-_RENDERED = (*COLUMNS[:-3], TIMES[-1])
+_RENDERED = (*COLUMNS[:-3], TIMES[-1], WARNINGS)
+#: Columns that are text, though it be empty.
+_TEXTS = ("failure", WARNINGS.name)
 
 
 class Table(NamedTuple):
     """The cases that ended, and those that others have of them; numbers, or text where there is none ("")."""
 
     keys: list[str]  # varied ones
-    rows: list[Row]  # case, keys, `COLUMNS`, failure, for each case of the sweep
+    rows: list[Row]  # case, keys, `COLUMNS`, failure, warnings, for each case of the sweep
     times: list[Row]  # case, `TIMES`
     beside: dict[int, Row]  # by case
     beside_name: str
@@ -77,10 +82,11 @@ def collect(sweep: Sweep, beside: Path | None = None) -> Table:
                 ) from None
         given: Row = {"case": case.number} | {key: _number(case.values.get(key, "")) for key in sweep.keys}
         figures: Row = {column.name: _figure(found, column.key) for column in COLUMNS}
-        rows.append(given | figures | {"failure": "not computed" if failure is None else failure})
+        warnings: Row = {WARNINGS.name: "; ".join(found.get(WARNINGS.key, []))}
+        rows.append(given | figures | {"failure": "not computed" if failure is None else failure} | warnings)
         times.append({"case": case.number} | {column.name: _figure(found, column.key) for column in TIMES})
-    name = beside.stem.replace("_", " ") if beside else ""
-    return Table(sweep.keys, rows, times, _read_beside(beside, sweep.keys, rows) if beside else {}, name)
+    theirs = _read_beside(beside, sweep.keys, rows) if beside else {}
+    return Table(sweep.keys, rows, times, theirs, beside.name if beside else "")
 
 
 def write(sweep: Sweep, table: Table) -> list[Path]:
@@ -109,7 +115,8 @@ def markdown(table: Table) -> str:
     headings, lines = _rendered(table)
     text = [f"| {' | '.join(headings)} |", "|" + "---|" * len(headings)]
     text += [f"| {' | '.join(cell.replace('|', '/') for cell in line)} |" for line in lines]
-    return "\n".join(text) + "\n"
+    warnings = [f"- {words}" for words in _warnings(table)]
+    return "\n".join([*text, *([""] if warnings else []), *warnings]) + "\n"
 
 
 def text(table: Table) -> str:
@@ -124,13 +131,13 @@ def text(table: Table) -> str:
     for line in (*heads, *lines):
         shown = line if not _is_remark(line, table) else [cell for cell in line if cell]
         made.append("  ".join(f"{cell:>{width}}" for cell, width in zip(shown, widths, strict=False)))
-    return "\n".join(made)
+    return "\n".join([*made, *_warnings(table)])
 
 
 def records(table: Table) -> list[dict[str, Any]]:
     """The rows with their times, for JSON."""
     return [
-        {name: None if value == "" and name != "failure" else value for name, value in (row | time).items()}
+        {name: None if value == "" and name not in _TEXTS else value for name, value in (row | time).items()}
         for row, time in zip(table.rows, table.times, strict=True)
     ]
 
@@ -178,10 +185,10 @@ def _read_beside(path: Path, keys: Sequence[str], rows: Sequence[Row]) -> dict[i
 
 
 def _columns(rows: Sequence[Row]) -> dict[str, list[float | str]]:
-    """Columns of numbers with nan where there is none; of text if there is a word in it, or for "failure"."""
+    """Columns of numbers with nan where there is none; of text if there is a word in it, or for `_TEXTS`."""
     columns: dict[str, list[float | str]] = {name: [row[name] for row in rows] for name in rows[0]}
     for name, values in columns.items():
-        if name != "failure" and all(value == "" or not isinstance(value, str) for value in values):
+        if name not in _TEXTS and all(value == "" or not isinstance(value, str) for value in values):
             columns[name] = [math.nan if value == "" else value for value in values]
     return columns
 
@@ -213,6 +220,12 @@ def _is_remark(line: list[str], table: Table) -> bool:
     return any(row["failure"] and row["failure"] in line for row in table.rows)
 
 
+def _warnings(table: Table) -> list[str]:
+    """What the marked cases were warned of, a line each."""
+    marked = [row for row in table.rows if row[WARNINGS.name]]
+    return [f"warning for {', '.join(table.keys)} = {_label(row, table.keys)}: {row[WARNINGS.name]}" for row in marked]
+
+
 def _pairs(table: Table) -> Iterator[tuple[Row, Row]]:
     return zip(table.rows, table.times, strict=True)
 
@@ -222,7 +235,7 @@ def _cells(row: Row, columns: Sequence[_Column]) -> list[str]:
 
 
 def _draw(table: Table, folder: Path) -> list[Path]:
-    """The charts: each quantity against the first varied key that is a number; error estimate against run time."""
+    """The charts: each quantity against the first varied key that is a number; distance from rest against run time."""
     try:
         from mpitled.results import charts
     except ImportError:
@@ -244,8 +257,12 @@ def _draw(table: Table, folder: Path) -> list[Path]:
         label = f"{key}, {unit}" if (unit := unit_of(key)) else key
         charts.draw_quantities(families, key, label, quantities, folder / "quantities.png")
         made.append(folder / "quantities.png")
-    if timed := [row for row in rows if row["error_estimate_mm"] != "" and row["loop_s"] != ""]:
-        points = [(float(row["loop_s"]), float(row["error_estimate_mm"]), _label(row, table.keys)) for row in timed]
+    if timed := [row for row in rows if row["static_distance_mm"] != "" and row["loop_s"] != ""]:
+        names = [_label(row, table.keys) + (" (warned)" if row[WARNINGS.name] else "") for row in timed]
+        points = [
+            (float(row["loop_s"]), float(row["static_distance_mm"]), name)
+            for row, name in zip(timed, names, strict=True)
+        ]
         charts.draw_cost(points, folder / "cost.png")
         made.append(folder / "cost.png")
     return made
@@ -261,10 +278,11 @@ def _html(sweep: Sweep, table: Table, charts: Sequence[Path]) -> str:
     title, n = sweep.cases[0].deck.title or sweep.deck.stem, len(sweep.cases)
     alt = {
         "quantities": f"Charts of the results against {table.keys[0]}",
-        "cost": "Chart of the error estimate in mm against the time of the loop in s",
+        "cost": "Chart of the distance from the static solution in mm against the time of the loop in s",
     }
+    warnings = _warnings(table)
     parts = {
-        "Results": [markup.table(headings, lines)],
+        "Results": [markup.table(headings, lines), *([markup.note(warnings)] if warnings else [])],
         "Charts": [markup.picture(path.read_bytes(), alt[path.stem]) for path in charts],
     }
     head = [markup.text(f"{n} cases of {sweep.deck.name}, varied: {', '.join(table.keys)}", "faint")]

@@ -140,9 +140,13 @@ def draw_prediction(rows: list[dict[str, Any]], subject: str, assumptions: str, 
 def draw_quantities(
     families: Mapping[str, Sequence[Mapping[str, Any]]], key: str, label: str, quantities: Mapping[str, str], path: Path
 ) -> None:
-    """Each quantity (name: heading) of rows against their number under `key`, a line for each family of rows."""
+    """Each quantity (name: heading) of rows against their number under `key`, a line for each family of rows.
+
+    Rows that have "warnings" are ringed.
+    """
     across = min(4, math.ceil(len(quantities) ** 0.5) + 1)
     down = math.ceil(len(quantities) / across)
+    warned = [row for rows in families.values() for row in rows if row.get("warnings")]
     figure = Figure(figsize=(3.4 * across, 2.7 * down + 0.5), layout="constrained")
     FigureCanvasAgg(figure)
     for i, (name, heading) in enumerate(quantities.items(), 1):
@@ -153,23 +157,29 @@ def draw_quantities(
                 [x for x, _ in points], [y for _, y in points], label=family or "here", linewidth=1, markersize=4,
                 color=_COLOURS[j % len(_COLOURS)], marker=_MARKERS[j % len(_MARKERS)],
             )  # fmt: skip
+        if warned:
+            ringed = [(row[key], row[name]) for row in warned if row[name] != ""]
+            axes.plot(
+                [x for x, _ in ringed], [y for _, y in ringed], label="warned", linestyle="", marker="o",
+                markersize=10, color=_INK, markerfacecolor="none",
+            )  # fmt: skip
         axes.set(xlabel=label, ylabel=heading)
         axes.grid(True, linewidth=0.3)
-    if len(families) > 1:
-        handles, names = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside lower center", ncols=min(4, len(families)), fontsize=8)
+    handles, names = figure.axes[0].get_legend_handles_labels()
+    if len(handles) > 1:
+        figure.legend(handles, names, loc="outside lower center", ncols=min(4, len(handles)), fontsize=8)
     figure.savefig(path, dpi=150)
 
 
 def draw_cost(points: Sequence[tuple[float, float, str]], path: Path) -> None:
-    """Error estimate (mm) against the time of the loop (s) of runs, each with its name beside it."""
+    """Distance (mm) from the static solution against the time of the loop (s) of runs, each with its name beside it."""
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    for seconds, error, name in points:
-        axes.plot(seconds, error, color=_COLOURS[1], marker="o", linestyle="none")
-        axes.annotate(name, (seconds, error), xytext=(6, 4), textcoords="offset points", fontsize=8)
-    _logarithmic(axes, "time of the loop, s", "error estimate, mm")
+    for seconds, distance, name in points:
+        axes.plot(seconds, distance, color=_COLOURS[1], marker="o", linestyle="none")
+        axes.annotate(name, (seconds, distance), xytext=(6, 4), textcoords="offset points", fontsize=8)
+    _logarithmic(axes, "time of the loop, s", "from the static solution, by its own estimate, mm")
     figure.savefig(path, dpi=150)
 
 
