@@ -21,6 +21,7 @@ from mpitled.deck import load_deck
 from mpitled.errors import InputError, InterruptedRun
 from mpitled.solver import job
 from mpitled.solver.halo import World
+from mpitled.solver.progress import Progress
 from mpitled.solver.run import Run
 
 BLOCK = (
@@ -144,6 +145,17 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_it_used(stopped, monke
     (folder / "result.vtkhdf").unlink()
     with pytest.raises(InputError, match="begin anew"):
         run(deck, folder, monkeypatch, resume=True)
+
+
+def test_a_run_says_where_it_goes_on_and_counts_from_there(stopped, capsys):
+    deck, folder = stopped
+    step = store.checkpoint_contents(folder / store.CHECKPOINTS[0])["step"]
+    job.run(load_deck(deck), folder, World(), resume=True)
+    assert f"note: goes on from step {step:,} (" in capsys.readouterr().err
+    progress = Progress(0.5, 10_000)
+    progress.begin -= 10
+    progress.show(0.75, 11_000, {"kinetic_ratio": 0.0, "min_jacobian": 1.0})
+    assert capsys.readouterr().err.startswith(" 75%     10 s left  100 steps/s")
 
 
 def flipped(rng: np.random.Generator) -> Any:

@@ -59,30 +59,30 @@ class Interrupts:
 class Progress:
     """How far the run is, on stderr: a bar on a terminal, a line every tenth elsewhere."""
 
-    def __init__(self) -> None:
-        self.begin, self.tenth, self.bar = time.perf_counter(), 0, None
+    def __init__(self, done: float, step: int) -> None:
+        """From the share that is done, and the step, which are not 0 where a run goes on."""
+        self.begin, self.first_done, self.first_step = time.perf_counter(), done, step
+        self.tenth, self.bar = int(10 * done), None
         if sys.stderr.isatty():
             try:
                 from tqdm import tqdm
             except ImportError:
                 return
-            self.bar = tqdm(total=1.0, bar_format="{percentage:3.0f}%|{bar}| {remaining} left{postfix}")
+            self.bar = tqdm(total=1.0, initial=done, bar_format="{percentage:3.0f}%|{bar}| {remaining} left{postfix}")
 
     def show(self, done: float, step: int, figures: dict[str, float]) -> None:
-        rate = step / max(time.perf_counter() - self.begin, 1e-9)
+        seconds = max(time.perf_counter() - self.begin, 1e-9)
+        rate = (step - self.first_step) / seconds
         state = (
             f"{rate:.0f} steps/s, kinetic/internal {figures['kinetic_ratio']:.1e}, min J {figures['min_jacobian']:.3f}"
         )
         if self.bar is not None:
             self.bar.set_postfix_str(state, refresh=False)
             self.bar.update(max(0.0, done - self.bar.n))
-        elif int(10 * done) > self.tenth:
-            self.tenth = int(10 * done)
-            left = max(0.0, (1 - done) / done * (time.perf_counter() - self.begin))
+        elif (tenth := int(10 * done + 1e-6)) > self.tenth:  # the sum of all steps is short of 1 by round-off
+            self.tenth = tenth
+            left = max(0.0, (1 - done) / (done - self.first_done) * seconds)
             print(f"{done:4.0%}  {left:5.0f} s left  {state}", file=sys.stderr, flush=True)
-
-    def tell(self, words: str) -> None:
-        print(f"note: {words}", file=sys.stderr, flush=True)
 
     def close(self) -> None:
         if self.bar is not None:

@@ -6,6 +6,7 @@ import importlib.metadata
 import logging
 import math
 import resource
+import sys
 import time
 from collections import deque
 from pathlib import Path
@@ -69,7 +70,8 @@ class Run:
             self.method = self._relaxation()
         else:
             self.method = March(solver, frames, sub, world, self.force_halo, self._halo(1), model)
-        self.progress = None if quiet or not world.leads else Progress()
+        self.tells = world.leads and not quiet
+        self.progress: Progress | None = None  # made when the loop begins
         self.about, self.found, self.interrupts = about, found, Interrupts(world)
         self.term_seconds: dict[str, float] = {}
         self.distance = math.nan
@@ -126,8 +128,8 @@ class Run:
                 self._resume(self.found)
             else:
                 self.method.begin()
-                if self.world.on_leader(lambda: store.discard_checkpoints(self.directory)) and self.progress:
-                    self.progress.tell("the checkpoint of an earlier run is discarded; --resume would go on from it")
+                if self.world.on_leader(lambda: store.discard_checkpoints(self.directory)):
+                    self._tell("the checkpoint of an earlier run is discarded; --resume would go on from it")
         writer = store.ResultWriter(
             self.directory,
             self.world.comm,
@@ -145,6 +147,8 @@ class Run:
         interrupts.looked_for = True
         try:
             if self.made is None:
+                if self.tells:
+                    self.progress = Progress(self.method.progress, self.method.state.step)
                 self._advance(writer)
                 aside = sum(self.phases.seconds.get(name, 0.0) for name in ("output", "checkpoints"))
                 self.phases.seconds["loop"] = time.perf_counter() - begin - aside
@@ -174,6 +178,10 @@ class Run:
         with self.phases("close"):
             writer.close(self.made | {"seconds": seconds})
         return seconds
+
+    def _tell(self, words: str) -> None:
+        if self.tells:
+            print(f"note: {words}", file=sys.stderr, flush=True)
 
     def _advance(self, writer: store.ResultWriter) -> None:
         """Steps, a survey and decisions, and so on to the end of the method."""
@@ -253,7 +261,7 @@ class Run:
         method = self.method
         asked = KEEP if time.perf_counter() >= self.next_checkpoint else 0
         self.watch.look(method, END if self.interrupts.asked else asked)
-        if self.progress:
+        if self.progress and self.loaded is None:
             self.progress.show(method.progress, method.state.step, self.watch.figures)
         self.good[:] = method.state.u[:, : self.sub.n_nodes]
         self.good_time, self.good_figures = method.frame_time, self.watch.figures
@@ -329,6 +337,10 @@ class Run:
         self.method.state.show()
         self.good[:] = self.method.state.u[:, : self.sub.n_nodes]
         self.first_step = self.method.state.step
+        if self.loaded is None:
+            self._tell(f"goes on from step {self.first_step:,} ({self.method.progress:.1%})")
+        else:
+            self._tell("goes on from the end of the load, to find its distance from the static solution")
 
     def _end_if_stalled(self, relaxation: Relaxation) -> None:
         if relaxation.stalled:
