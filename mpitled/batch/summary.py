@@ -61,7 +61,7 @@ class Table(NamedTuple):
     """The cases that ended, and those that others have of them; numbers, or text where there is none ("")."""
 
     keys: list[str]  # varied ones
-    rows: list[Row]  # case, keys, `COLUMNS`, failure, warnings, for each case of the sweep
+    rows: list[Row]  # case, keys, `COLUMNS`, warnings, failure, for each case of the sweep
     times: list[Row]  # case, `TIMES`
     beside: dict[int, Row]  # by case
     beside_name: str
@@ -83,7 +83,7 @@ def collect(sweep: Sweep, beside: Path | None = None) -> Table:
         given: Row = {"case": case.number} | {key: _number(case.values.get(key, "")) for key in sweep.keys}
         figures: Row = {column.name: _figure(found, column.key) for column in COLUMNS}
         warnings: Row = {WARNINGS.name: "; ".join(found.get(WARNINGS.key, []))}
-        rows.append(given | figures | {"failure": "not computed" if failure is None else failure} | warnings)
+        rows.append(given | figures | warnings | {"failure": "not computed" if failure is None else failure})
         times.append({"case": case.number} | {column.name: _figure(found, column.key) for column in TIMES})
     theirs = _read_beside(beside, sweep.keys, rows) if beside else {}
     return Table(sweep.keys, rows, times, theirs, beside.name if beside else "")
