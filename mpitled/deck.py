@@ -32,6 +32,9 @@ _MOST_BYTES, _MOST_PARTS = 1 << 18, 100
 _FINEST = 1e-30
 #: What is between the dots of a key, and what else there is in TOML.
 _TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"?|\'[^\'\n]*\'?|[\w-]+|[ \t]+|.', re.DOTALL)
+_DECIMAL_COMMA = re.compile(r"=\s*[-+]?\d+,\d+\s*(#|$)")
+#: Names that meshes have, and decks never.
+_OF_MESHES = (".inp", ".k", ".key", ".dyn", ".msh", ".vtk", ".vtu")
 #: Units of the deck that are not SI: how many make one SI unit. Dividing by a power of ten rounds 5.1 mm to 0.0051 m.
 _PER_SI = {"mm": 1e3, "mm3": 1e9, "degrees": 180 / math.pi}
 
@@ -350,15 +353,17 @@ def _axes(section: Fixed | Displaced) -> tuple[int, ...]:
 # --- from TOML -----------------------------------------------------------------------------------------------------
 
 
-def load_deck(path: str | Path, overrides: Sequence[str] = ()) -> Deck:
+def load_deck(path: str | Path, overrides: Sequence[str] = (), varied: Sequence[str] = ()) -> Deck:
     """The scene of a TOML file, changed by overrides "section.key=value"; all that is wrong with it is an InputError.
 
     The right side of an override is a TOML value; quotes around a string may be left out. Entries of [[fixed]] and
     [[displaced]] count from 0: "fixed.0.nodes=skull". Files are relative to the deck's folder, also in overrides.
+    Those of a case or variant, `varied`, come last; messages tell them apart.
     """
     path = Path(path)
     table = _parse(path)
-    source = _Source(path, frozenset(_override(table, text) for text in overrides))
+    given = [*(("--set", text) for text in overrides), *(("varied", text) for text in varied)]
+    source = _Source(path, {_override(table, text, option): option for option, text in given})
     deck: Deck = _section(Deck, table, "", source, {"path": path})
     _check(deck, source)
     return deck
@@ -368,17 +373,18 @@ class _Source(NamedTuple):
     """Where values come from, for messages."""
 
     path: Path
-    overridden: frozenset[str]
+    overridden: Mapping[str, str]  # keys, and by what: --set, or varied
 
     def error(self, name: str, what: str, value: Any = MISSING) -> InputError:
         # An override of a part, or of the section around it, is to blame too.
-        overridden = any(f"{name}.".startswith(f"{o}.") or o.startswith(f"{name}.") for o in self.overridden)
+        to_blame = (key for key in self.overridden if f"{name}.".startswith(f"{key}.") or key.startswith(f"{name}."))
+        origin = self.overridden.get(next(to_blame, ""), self.path)
         try:
             shown = "" if value is MISSING else f" = {_show(value)}"
         except (RecursionError, ValueError):  # nested without end, or an integer of thousands of digits
             shown = ""
         name = _shorten(name)
-        return InputError(_line(f"{'--set' if overridden else self.path}: {name}{shown}: {what}"))
+        return InputError(_line(f"{origin}: {name}{shown}: {what}"))
 
 
 def _parse(path: Path) -> dict[str, Any]:
@@ -389,6 +395,9 @@ def _parse(path: Path) -> dict[str, Any]:
             content = file.read(_MOST_BYTES + 1)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}; give the path of a deck (TOML)") from None
+    if path.suffix.lower() in _OF_MESHES:
+        what = f'is a mesh; check it by: mpitled check {path}; a deck computes it by: [mesh] fe = "{path.name}"'
+        raise InputError(f"{path}: {what}")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -424,30 +433,33 @@ def _syntax(text: str, error: Exception) -> str:
     if not line:
         return f"{message}; correct the TOML"
     shown = _shorten(_line(text.split("\n")[int(line[1]) - 1].strip()))
-    return f"line {line[1]}: {message[: line.start()].rstrip(' (at')}: {shown}; correct the TOML"
+    what = message[: line.start()].removesuffix(" (at ")
+    if _DECIMAL_COMMA.search(shown):
+        what += " (decimals come after a point)"
+    return f"line {line[1]}: {what}: {shown}; correct the TOML"
 
 
-def _override(table: dict[str, Any], text: str) -> str:
+def _override(table: dict[str, Any], text: str, option: str) -> str:
     """Enter "section.key=value" into the table of the deck; the key's name."""
     name, equals, value = (part.strip() for part in text.partition("="))
     text = _line(text)
     steps = name.split(".")
     if not equals or not all(steps):
-        raise InputError(f"--set {text}: is not section.key=value; write for example --set tumour.volume=523.6")
+        raise InputError(f"{option} {text}: is not section.key=value; write for example --set tumour.volume=523.6")
     try:
         parsed = tomllib.loads(f"value = {value}")["value"]
     except (ValueError, RecursionError):
         if value[:1] in {"", '"', "'", "[", "{"}:
-            raise InputError(f"--set {text}: the value is not TOML; check quotes and brackets") from None
+            raise InputError(f"{option} {text}: the value is not TOML; check quotes and brackets") from None
         parsed = value
     place: Any = table
     for depth, step in enumerate(steps):
         within = ".".join(steps[:depth])
         if isinstance(place, list):
             if not step.isdecimal() or int(step) >= len(place):
-                raise InputError(f"--set {text}: the deck has {len(place)} [[{within}]]; count them from 0")
+                raise InputError(f"{option} {text}: the deck has {len(place)} [[{within}]]; count them from 0")
         elif not isinstance(place, dict):
-            raise InputError(f"--set {text}: {within} is a value, not a section; leave out .{step}")
+            raise InputError(f"{option} {text}: {within} is a value, not a section; leave out .{step}")
         at: Any = int(step) if isinstance(place, list) else step
         if depth == len(steps) - 1:
             place[at] = parsed
@@ -769,7 +781,7 @@ def recorded(table: Mapping[str, Any], path: Path) -> Deck:
     """The deck that `canonical` told so, without its geometry and its motion, whose files may be gone by now."""
     without = (*GEOMETRIES, "fixed", "displaced")
     kept = {name: section for name, section in table.items() if name not in without}
-    deck: Deck = _section(Deck, kept, "", _Source(path, frozenset()), {"path": path})
+    deck: Deck = _section(Deck, kept, "", _Source(path, {}), {"path": path})
     return deck
 
 

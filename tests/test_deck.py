@@ -244,6 +244,20 @@ def test_bad_toml_is_named_with_its_line(tmp_path, text, line):
         assert "to some" not in message
 
 
+def test_what_a_parser_says_is_whole(tmp_path):
+    assert "line 1: Invalid statement: = 1; " in complaint(write(tmp_path, "= 1\n"))
+    message = complaint(write(tmp_path, "[tumour]\nvolume = 523,6\n"))
+    assert "after a statement (decimals come after a point): volume = 523,6; " in message
+
+
+def test_a_mesh_is_no_deck(tmp_path):
+    path = tmp_path / "fe.inp"
+    path.write_text("*NODE\n")
+    assert complaint(path) == (
+        f'{path}: is a mesh; check it by: mpitled check {path}; a deck computes it by: [mesh] fe = "fe.inp"'
+    )
+
+
 def test_bytes_that_are_no_text_are_named_with_their_line(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_bytes('# Größe\n\ntitle = "'.encode() + "Größe".encode("latin-1") + b'"\n')

@@ -108,7 +108,7 @@ def plan(
     scenes = []
     for given in values:
         overrides = vary.overrides(base, given)
-        scene = decks.load_deck(deck, overrides)
+        scene = decks.load_deck(deck, base, vary.words(given))
         if one_growth:
             _check_growth(scene, given)
             if scene.output.frames < FRAMES:

@@ -62,8 +62,13 @@ def table(path: Path) -> list[Values]:
 
 
 def overrides(base: Sequence[str], values: Values) -> tuple[str, ...]:
-    """What `load_deck` takes for these values, after those for all."""
-    return (*base, *(f"{key}={value}" for key, value in values.items()))
+    """What a run takes for these values, after what is for all."""
+    return (*base, *words(values))
+
+
+def words(values: Values) -> list[str]:
+    """The values as overrides, "key=value"."""
+    return [f"{key}={value}" for key, value in values.items()]
 
 
 def folder(words: str, content: str) -> str:
