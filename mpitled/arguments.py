@@ -102,7 +102,9 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
         metavar="KEY=A,B,...",
         help="a family of runs; keys that go together: KEY=A,B+KEY=C,D; ranks=1,2 varies the ranks; repeatable",
     )
-    study.add_argument("--reference", type=Path, help="what errors are against (see compare); else the own estimate")
+    study.add_argument(
+        "--reference", type=Path, help="what errors are against (see compare); else the run of most work"
+    )
     study.add_argument("--beyond", type=float, metavar="MM", help="errors farther than this from prescribed edges")
 
     stability = command(

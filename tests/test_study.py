@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import json
 import shutil
 
 from conftest import ROOT, complaint, mpitled
+from scenes import TUMOUR
 
 CUBE = ROOT / "jobs" / "validation" / "cube.toml"
 REFERENCE = ROOT / "tests" / "data" / "E3_cube_stress_50.npz"
@@ -54,6 +56,31 @@ def test_a_study_goes_on_where_it_stopped_and_tells_errors_and_failures(tmp_path
     again = mpitled(*arguments)
     assert again.stderr.count("/6: ") == 1
     assert removed.exists()
+
+
+def test_without_a_reference_runs_are_compared_with_the_one_of_most_work(tmp_path):
+    """Each of these ends within 0.01 mm of its own rest, which says nothing of its cloud."""
+    deck, out = tmp_path / "scene.toml", tmp_path / "study"
+    deck.write_text(TUMOUR)
+    keys = ["solver.method=dynamic-relaxation", "output.pictures=false"]
+    base = [word for key in keys for word in ("--set", key)]
+    done = mpitled("study", deck, *base, "--vary", "cloud.growth=1.0,0.3", "--out", out)
+    table = rows(out)
+    (finest,) = [row for row in table if row["is_reference"]]
+    assert finest["value"] == "0.3"
+    assert finest["max_error_mm"] == ""
+    own, coarse, _ = table
+    assert 0.05 < float(own["max_error_mm"]) < float(coarse["max_error_mm"])
+    assert "difference, mm" in done.stdout
+    assert "reference" in done.stdout
+    report = json.loads(next(out.glob("cloud.growth-1.0-*/report.json")).read_text())
+    assert float(coarse["cloud_misfit_mm"]) == report["cloud_misfit_mm"]
+    assert coarse["warnings"] == "; ".join(report["warnings"]) != ""
+    line = next(line for line in done.stdout.splitlines() if " 1.0 " in line)
+    assert "!" in line[:3]
+    alone = mpitled("study", deck, *base, "--out", tmp_path / "alone")
+    assert "no picture" in alone.stderr
+    assert "reference" in alone.stdout
 
 
 def test_what_cannot_be_varied_is_said_before_anything_runs(tmp_path):

@@ -17,8 +17,8 @@ from mpitled.errors import InputError
 from mpitled.results import compare
 
 COLUMNS = (
-    "family", "value", "ranks", "max_error_mm", "rms_error_mm", "static_distance_mm", "loop_s", "whole_s", "steps",
-    "cells", "cell_updates", "pareto", "failure",
+    "family", "value", "ranks", "max_error_mm", "rms_error_mm", "cloud_misfit_mm", "static_distance_mm", "loop_s",
+    "whole_s", "steps", "cells", "cell_updates", "pareto", "is_reference", "warnings", "failure",
 )  # fmt: skip
 
 
@@ -54,12 +54,12 @@ def study(
 ) -> list[dict[str, Any]]:
     """Run what has not been run yet, one after the other, and tell what all of them gave: study.csv and study.png.
 
-    Errors (mm) are against the reference beyond so far (m) from edges, or, without one, the run's own estimate.
-    InputError for keys and values that the deck does not take, before anything runs.
+    Errors (mm) are against the reference beyond so far (m) from edges, or, without one, against the run of most cell
+    updates: how near a run is to rest says nothing of its mesh. InputError for keys and values that the deck does not take, before anything runs.
     """
     todo = list(variants(vary, base))
     for variant in todo:
-        load_deck(deck, variant.overrides)
+        load_deck(deck, base, variant.overrides[len(base) :])
     out.mkdir(parents=True, exist_ok=True)
     rows = []
     for i, variant in enumerate(todo, 1):
@@ -67,41 +67,53 @@ def study(
         if (failure := launch.outcome(folder)) is None:
             print(f"{i}/{len(todo)}: {variant.family} {variant.value}", file=sys.stderr, flush=True)
             failure = launch.run_apart(deck, variant.overrides, variant.ranks, folder)
-        rows.append(_row(variant, failure, folder, reference, beyond))
+        rows.append(_row(variant, failure, folder))
+    done = [(row, out / variant.folder) for row, variant in zip(rows, todo, strict=True) if not row["failure"]]
+    if reference is None and done:
+        finest, reference = max(done, key=lambda run: run[0]["cell_updates"])
+        finest["is_reference"] = True
+    for row, folder in done:
+        if not row["is_reference"]:
+            groups = compare.compare(folder, reference, beyond)["groups"]
+            found = groups["free beyond" if beyond is not None else "free"]
+            row |= {"max_error_mm": found["largest_mm"][-1], "rms_error_mm": found["rms_mm"][-1]}
     for row in rows:
         row["pareto"] = _is_best(row, rows)
     atomic.write_csv(out / "study.csv", COLUMNS, rows)
+    if not any(row["max_error_mm"] for row in rows):  # of runs that failed, or of one alone
+        print(f"{out}: no picture, for there are no errors to draw", file=sys.stderr)
+        return rows
     try:
         from mpitled.results import charts
     except ImportError:
         print(f"{out}: no picture, for matplotlib is missing", file=sys.stderr)
     else:
-        charts.draw_study(rows, out / "study.png", "largest error, mm" if reference else "estimated error, mm")
+        charts.draw_study(rows, out / "study.png", f"largest {_named(rows)}, mm")
     return rows
 
 
-def _row(variant: Variant, failure: str, folder: Path, reference: Path | None, beyond: float | None) -> dict[str, Any]:
+def _row(variant: Variant, failure: str, folder: Path) -> dict[str, Any]:
     row: dict[str, Any] = dict.fromkeys(COLUMNS, "")
     row |= {"family": variant.family, "value": variant.value, "ranks": variant.ranks, "failure": failure}
     if failure:
         return row
     report = json.loads((folder / "report.json").read_text())
     cells = sum(report["cells"].values())
-    row |= {
+    return row | {
+        "cloud_misfit_mm": report.get("cloud_misfit_mm", ""),
         "static_distance_mm": report.get("static_distance_mm", ""),
         "loop_s": report["seconds"]["loop"],
         "whole_s": sum(report["seconds"].values()),
         "steps": report["steps"],
         "cells": cells,
         "cell_updates": cells * report["steps"],
+        "warnings": "; ".join(report["warnings"]),
     }
-    if reference is None:
-        row["max_error_mm"] = row["static_distance_mm"]
-    else:
-        groups = compare.compare(folder, reference, beyond)["groups"]
-        found = groups["free beyond" if beyond is not None else "free"]
-        row |= {"max_error_mm": found["largest_mm"][-1], "rms_error_mm": found["rms_mm"][-1]}
-    return row
+
+
+def _named(rows: list[dict[str, Any]]) -> str:
+    """What the errors are: without a reference they are not known, but how far runs are from the one of most work."""
+    return "difference" if any(row["is_reference"] for row in rows) else "error"
 
 
 def _is_best(row: dict[str, Any], rows: list[dict[str, Any]]) -> bool:
@@ -118,16 +130,21 @@ def _is_best(row: dict[str, Any], rows: list[dict[str, Any]]) -> bool:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """The runs as lines for the terminal, a star for those that none beats in both error and time."""
-    lines = [f"{'':2}{'family':34}{'value':24}{'error, mm':>11}{'rms, mm':>10}{'loop, s':>9}{'steps':>8}{'cells':>9}"]
+    """The runs as lines for the terminal: * none beats it in both error and time; ! it was warned of."""
+    error = f"{_named(rows)}, mm"
+    lines = [
+        f"{'':3}{'family':34}{'value':24}{error:>15}{'rms, mm':>10}{'misfit, mm':>12}{'loop, s':>9}{'steps':>8}{'cells':>9}"
+    ]
     for row in rows:
         if row["failure"]:
-            lines.append(f"  {row['family']:34}{row['value']:24}  {row['failure'][:90]}")
+            lines.append(f"   {row['family']:34}{row['value']:24}  {row['failure'][:90]}")
             continue
-        numbers = "".join(
-            f"{row[name]:{width}.{digits}g}" if row[name] != "" else " " * width
-            for name, width, digits in (("max_error_mm", 11, 3), ("rms_error_mm", 10, 3), ("loop_s", 9, 3))
-        )
-        star = "*" if row["pareto"] else ""
-        lines.append(f"{star:2}{row['family']:34}{row['value']:24}{numbers}{row['steps']:8}{row['cells']:9}")
+        names = (("max_error_mm", 15), ("rms_error_mm", 10), ("cloud_misfit_mm", 12), ("loop_s", 9))
+        numbers = [f"{row[name]:{width}.3g}" if row[name] != "" else " " * width for name, width in names]
+        if row["is_reference"]:
+            numbers[0] = f"{'reference':>15}"
+        marks = ("*" if row["pareto"] else "") + ("!" if row["warnings"] else "")
+        lines.append(f"{marks:3}{row['family']:34}{row['value']:24}{''.join(numbers)}{row['steps']:8}{row['cells']:9}")
+    if any(row["warnings"] for row in rows):
+        lines.append("! warned of: its report.json says why, and the column warnings of study.csv")
     return "\n".join(lines)
