@@ -302,8 +302,9 @@ def test_an_unstable_run_stops_and_says_why(tmp_path, n):
     """A block pressed through itself: no step and no mass can save it."""
     path = deck(tmp_path, STRETCH, cloud="core", millimetres=-45.0, load_time=0.1)
     line = complaint(mpitled("run", path, "--out", tmp_path / "out", n=n, status=3))
-    for word in ("unstable at", "mm", "J = ", "rank", "brain", "load_time"):
+    for word in ("unstable at", "mm", "J = ", "rank", "brain", "(a longer solver.load_time)"):
         assert word in line
+    assert "seed_radius" not in line
     with open_result(tmp_path / "out") as result:
         assert not result.complete
         assert result.n_frames >= 2  # at rest, and the last good state
@@ -319,7 +320,10 @@ def test_an_unstable_run_recovers_on_request(tmp_path, grown, method, keys):
     """It ends where a slow, safe run ends, within what both say is left to the static solution."""
     path = deck(tmp_path, GROWTH, volume=523.6)
     words = [word for key in (f"solver.method={method}", *keys) for word in ("--set", key)]
-    mpitled("run", path, "--out", tmp_path / "stops", *words, status=3)
+    line = complaint(mpitled("run", path, "--out", tmp_path / "stops", *words, status=3))
+    assert ("more solver.load_steps" in line) == (method == "dynamic-relaxation")
+    assert ("a longer solver.load_time" in line) == (method == "quasi-static")
+    assert "tumour.seed_radius" in line
     mpitled("run", path, "--out", tmp_path / "recovers", *words, "--set", "solver.on_inversion=recover")
     report = json.loads((tmp_path / "recovers" / "report.json").read_text())
     assert 1 <= report["recoveries"] <= 5

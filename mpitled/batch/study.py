@@ -55,7 +55,8 @@ def study(
     """Run what has not been run yet, one after the other, and tell what all of them gave: study.csv and study.png.
 
     Errors (mm) are against the reference beyond so far (m) from edges, or, without one, against the run of most cell
-    updates: how near a run is to rest says nothing of its mesh. InputError for keys and values that the deck does not take, before anything runs.
+    updates: how near a run is to rest says nothing of its mesh. InputError for keys and values that the deck does not
+    take, before anything runs.
     """
     todo = list(variants(vary, base))
     for variant in todo:
@@ -73,7 +74,7 @@ def study(
         finest, reference = max(done, key=lambda run: run[0]["cell_updates"])
         finest["is_reference"] = True
     for row, folder in done:
-        if not row["is_reference"]:
+        if reference and not row["is_reference"]:
             groups = compare.compare(folder, reference, beyond)["groups"]
             found = groups["free beyond" if beyond is not None else "free"]
             row |= {"max_error_mm": found["largest_mm"][-1], "rms_error_mm": found["rms_mm"][-1]}
@@ -132,9 +133,8 @@ def _is_best(row: dict[str, Any], rows: list[dict[str, Any]]) -> bool:
 def table(rows: list[dict[str, Any]]) -> str:
     """The runs as lines for the terminal: * none beats it in both error and time; ! it was warned of."""
     error = f"{_named(rows)}, mm"
-    lines = [
-        f"{'':3}{'family':34}{'value':24}{error:>15}{'rms, mm':>10}{'misfit, mm':>12}{'loop, s':>9}{'steps':>8}{'cells':>9}"
-    ]
+    heading = f"{'':3}{'family':34}{'value':24}{error:>15}{'rms, mm':>10}{'misfit, mm':>12}"
+    lines = [heading + f"{'loop, s':>9}{'steps':>8}{'cells':>9}"]
     for row in rows:
         if row["failure"]:
             lines.append(f"   {row['family']:34}{row['value']:24}  {row['failure'][:90]}")

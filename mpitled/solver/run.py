@@ -76,7 +76,7 @@ class Run:
         self.term_seconds: dict[str, float] = {}
         self.distance = math.nan
         self.volume = model["volume_m3"]
-        self.watch = Watch(world, sub, self.volume)
+        self.watch = Watch(world, sub, self.volume, _remedy(deck))
         self.recoveries, self.looks = 0, 0
         self.frames, self.written = 0, -math.inf  # how many, and the time of the last
         # What a ramp came to, figures and displacements, from where its distance to the static solution is looked for.
@@ -356,7 +356,7 @@ class Run:
         if self.loaded is None:
             ramp, energy = self.method.state, self.watch.own_energy
             self.loaded = ramp.u[:, :n].copy()
-            self.method, self.watch = self._relaxation(), Watch(self.world, self.sub, self.volume)
+            self.method, self.watch = self._relaxation(), Watch(self.world, self.sub, self.volume, _remedy(self.deck))
             self.method.start_from(ramp, energy)
             self.method.begin()
         relaxation = self.method
@@ -482,6 +482,15 @@ class Run:
                 "at_end": figures["kinetic_ratio"],
             },
         }
+
+
+def _remedy(deck: Deck) -> str:
+    """What keeps such a scene stable."""
+    slower = "more solver.load_steps" if deck.solver.method == "dynamic-relaxation" else "a longer solver.load_time"
+    finer = "refine the mesh or the cloud there"
+    if deck.tumour:
+        return f"load more slowly ({slower}), {finer}, or enlarge tumour.seed_radius or cloud.radius"
+    return f"load more slowly ({slower}), or {finer}"
 
 
 _SERIES = (

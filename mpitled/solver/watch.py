@@ -27,9 +27,9 @@ class Watch:
 
     LASTING = Kept(alike=("figures", "largest_kinetic_ratio", "largest_energy"))
 
-    def __init__(self, world: World, sub: Subdomain, volume: float) -> None:
-        """volume: of the whole model, m^3."""
-        self.world, self.sub = world, sub
+    def __init__(self, world: World, sub: Subdomain, volume: float, remedy: str) -> None:
+        """volume: of the whole model, m^3; remedy: of instability."""
+        self.world, self.sub, self.remedy = world, sub, remedy
         self.figures: dict[str, float] = {}  # of all ranks, at the last look
         self.own_energy = 0.0  # J, in this rank's cells
         self.largest_kinetic_ratio = 0.0
@@ -73,8 +73,7 @@ class Watch:
         cell = world.broadcast(self._worst_cell(method) if world.rank == worst else None, worst)
         raise UnstableError(
             f"unstable at {state.share:.1%} of the load: {reason}; {cell}; the step is "
-            f"{figures['step_ratio']:.2f} of the longest stable one; load more slowly (solver.load_time, "
-            "solver.load_steps), refine the mesh or the cloud there, or enlarge cloud.radius"
+            f"{figures['step_ratio']:.2f} of the longest stable one; {self.remedy}"
         )
 
     def _worst_cell(self, method: March | Relaxation) -> str:
