@@ -27,3 +27,8 @@ def __getattr__(name: str) -> Any:
 
         return getattr(interface, name)
     raise AttributeError(f"module 'mpitled' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    """For completion: what has not been used yet as well."""
+    return sorted({*globals(), *__all__})

@@ -76,6 +76,16 @@ class Frames:
     def __len__(self) -> int:
         return self._n_frames
 
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of all frames together, (n_frames, ...), as `numpy.stack` makes them; a frame is read for it."""
+        return (self._n_frames, *self[0].shape)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Of each frame, one of which is read for it."""
+        return self[0].dtype
+
     def __getitem__(self, frame: int) -> NDArray[Any]:
         if not -self._n_frames <= frame < self._n_frames:
             raise IndexError(f"there are {self._n_frames} frames, and no {frame}")

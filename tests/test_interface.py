@@ -36,6 +36,7 @@ def test_importing_costs_nothing():
     took, heavy, _ = done.stdout.split()
     assert float(took) < 0.1
     assert heavy == "False"
+    assert {"load_deck", "build_model", "run_deck", "open_result", "open_sweep"} <= {*dir(package)}
     with pytest.raises(AttributeError, match="no_such_thing"):
         _ = package.no_such_thing
 
@@ -59,6 +60,8 @@ def test_arrays_are_read_frame_by_frame_in_the_models_order(result):
         assert opened.complete
         np.testing.assert_array_equal(opened.points, model.points)
         assert len(opened.displacement) == len(opened.times) == 3
+        assert opened.displacement.shape == (3, model.n_nodes, 3) == np.stack(list(opened.displacement)).shape
+        assert opened.displacement.dtype == opened.displacement[0].dtype
         sizes = [1e3 * np.linalg.norm(u, axis=1).max() for u in opened.displacement]
         assert sizes[0] == 0
         assert sizes[-1] == report["max_displacement_mm"] == opened.report["max_displacement_mm"]
