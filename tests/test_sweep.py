@@ -21,6 +21,7 @@ from scenes import TUMOUR
 
 from mpitled import open_sweep
 from mpitled.batch import cases, screen, summary, vary
+from mpitled.batch import sweep as array
 from mpitled.errors import InputError
 from mpitled.store import checkpoint_contents
 
@@ -129,23 +130,55 @@ def test_a_table_says_which_cases_were_warned_of(tmp_path, groups):
         assert file["table/warnings"].asstr()[1] == "far from rest; coarse"
 
 
-def test_an_array_job_computes_each_task_alone(tmp_path):
-    """With launchers in the schedulers' place, which start what they are given."""
-    out, tools = tmp_path / "out", tmp_path / "bin"
-    words = ["--set", "block.elements=[2,2,2]", "--set", "solver.method=dynamic-relaxation"]
-    sweep = ["sweep", CUBE, *words, "--vary", "solver.load_steps=400,500,600", "--out", out]
-    tools.mkdir()
-    for name, skip in (("srun", 0), ("mpirun", 2)):
+def array_job(folder: Path, deck: Path, base: list[str], text: str, scheduler: str) -> tuple[Path, dict[str, str]]:
+    """The script for a sweep into folder/out, and variables with launchers that start what they are given.
+
+    The folder stands for a set-up clone: the scripts set up what is missing in the one that they are made in.
+    """
+    tools = folder / "bin"
+    for made in (tools, folder / "jobs"):
+        made.mkdir(exist_ok=True)
+    (folder / "jobs" / "environment.sh").write_text(f"touch {folder}/sourced\n")
+    for name, skip in (("srun", 1), ("mpirun", 2)):
         (tools / name).write_text(f'#!/bin/sh\nshift {skip}\nexec "$@"\n')
         (tools / name).chmod(0o755)
     path = os.pathsep.join([str(tools), str(Path(sys.executable).parent), ENVIRONMENT["PATH"]])
+    plan = cases.plan(deck, vary.grid([text]), base, 1, folder / "out")
+    return array.array_job(plan, scheduler), ENVIRONMENT | {"PATH": path}
+
+
+def test_an_array_job_computes_each_task_alone(tmp_path, monkeypatch):
+    """As jobs/slurm.sh does: in an environment that is set up, with the launcher's PMIx."""
+    monkeypatch.chdir(tmp_path)
+    base = ["block.elements=[2,2,2]", "solver.method=dynamic-relaxation"]
     for scheduler, number in (("slurm", "SLURM_ARRAY_TASK_ID"), ("pbs", "PBS_ARRAY_INDEX")):
-        script = mpitled(*sweep, "--scheduler", scheduler).stdout.strip()
-        assert "1-3\n" in Path(script).read_text()
-        task = {"PATH": path, number: "2" if scheduler == "slurm" else "3"}
-        subprocess.run([script], env=ENVIRONMENT | task, check=True, timeout=120, stderr=subprocess.DEVNULL)
+        script, variables = array_job(tmp_path, CUBE, base, "solver.load_steps=400,500,600", scheduler)
+        assert "1-3\n" in script.read_text()
+        assert "# 3 cases, each on 1 rank;" in script.read_text()
+        assert ("srun --mpi=pmix" in script.read_text()) == (scheduler == "slurm")
+        task = {number: "2" if scheduler == "slurm" else "3"}
+        subprocess.run([script], env=variables | task, check=True, timeout=120, stderr=subprocess.DEVNULL)
+        (tmp_path / "sourced").unlink()
+    out = tmp_path / "out"
     assert [case.failure for case in cases.read(out).cases] == [None, "", ""]
     assert mpitled("report", out).stdout.count("not computed") == 1
+
+
+def test_a_task_of_an_array_ends_in_order_before_its_time_is_up(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    deck, out = tmp_path / "scene.toml", tmp_path / "out"
+    deck.write_text(GROWTH)
+    script, variables = array_job(tmp_path, deck, ["solver.load_time=50"], "tumour.volume=150", "slurm")
+    variables |= {"SLURM_ARRAY_TASK_ID": "1"}
+    with subprocess.Popen([script], env=variables, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.time() + 60
+        while not list(out.glob("*/result.partial.vtkhdf")) and time.time() < deadline:
+            time.sleep(0.02)
+        time.sleep(0.5)
+        process.send_signal(signal.SIGUSR1)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 4, errors
+    assert list(out.glob("*/checkpoint.h5"))
 
 
 def test_a_screen_has_bars_on_a_terminal_alone(monkeypatch):

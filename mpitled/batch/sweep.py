@@ -98,7 +98,8 @@ def _alone(sweep: Sweep, world: World, only: int | None) -> Iterator[None]:
 def _as_processes(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], jobs: int) -> None:
     """A process for each case, so many at once; first the models that several cases share."""
     screen, working = Screen(), dict[Case, launch.Process]()
-    previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    ends = (signal.SIGTERM, signal.SIGUSR1)
+    previous = [signal.signal(which, signal.default_int_handler) for which in ends]
     try:
         for verb, cases in (("build", models), ("run", todo)):
             waiting = list(cases)
@@ -121,7 +122,8 @@ def _as_processes(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], jo
     finally:
         for process in working.values():
             process.stop()
-        signal.signal(signal.SIGTERM, previous)
+        for which, handler in zip(ends, previous, strict=True):
+            signal.signal(which, handler)
 
 
 def _start(sweep: Sweep, case: Case, verb: str) -> launch.Process:
@@ -233,25 +235,44 @@ def array_job(sweep: Sweep, scheduler: str) -> Path:
             f"#SBATCH --array=1-{n}",
             f"#SBATCH --ntasks={ranks}",
             "#SBATCH --cpus-per-task=1",
+            "#SBATCH --hint=nomultithread",
             "#SBATCH --time=01:00:00",
+            "#SBATCH --signal=B:USR1@120",
             f"#SBATCH --output={folder}/slurm-%a.log",
         ]
-        body = f'srun {words} "$SLURM_ARRAY_TASK_ID"'
+        body = [
+            "launch=(srun --mpi=pmix)",
+            f"command -v srun >/dev/null || launch=(mpirun -n {ranks})",
+            f'"${{launch[@]}}" {words} "$SLURM_ARRAY_TASK_ID" &',
+            "job=$!",
+            "trap 'kill -USR1 \"$job\"' USR1",
+            "status=0",
+            'wait "$job" || status=$?',
+            '[ "$status" -le 128 ] || { status=0 && wait "$job" || status=$?; }',
+            'exit "$status"',
+        ]
     else:
         head = [f"#PBS -l select=1:ncpus={ranks}:mpiprocs={ranks}", "#PBS -l walltime=01:00:00", f"#PBS -o {folder}"]
         head += [f"#PBS -J 1-{n}"] if n > 1 else []  # PBS refuses arrays of one
-        body = f'mpirun -n {ranks} {words} "${{PBS_ARRAY_INDEX:-1}}"'
+        body = [f'mpirun -n {ranks} {words} "${{PBS_ARRAY_INDEX:-1}}"']
     script = [
         "#!/usr/bin/env bash",
         *head,
-        f"# {n} cases, each on {ranks} ranks; set the time that the longest takes, and your queue.",
+        f"# {_count(n, 'case')}, each on {_count(ranks, 'rank')}; set the time that the longest takes, and your queue.",
+        "# What its time cuts off goes on from its checkpoint when this is submitted again, and what is done stays.",
         f"# Afterwards: mpitled report {shlex.quote(str(folder))}",
         "set -euo pipefail",
-        "export OMP_NUM_THREADS=1",
         f"cd {shlex.quote(str(Path.cwd()))}",
-        body,
+        "# module load openmpi hdf5",
+        "[ ! -f jobs/environment.sh ] || . jobs/environment.sh",
+        "export OMP_NUM_THREADS=1",
+        *body,
     ]
     path = sweep.folder / f"{scheduler}.sh"
     path.write_text("\n".join(script) + "\n")
     path.chmod(0o755)
     return path
+
+
+def _count(n: int, what: str) -> str:
+    return f"{n} {what}" if n == 1 else f"{n} {what}s"
