@@ -15,10 +15,11 @@ def test_from_a_segmentation_to_a_table(segmentation):
     """The page that it makes is in test_page.py."""
     out, said = segmentation
     assert "ventricles, change" in said
-    table = (out / "table" / "table.csv").read_text().splitlines()
-    assert [line.split(",")[1] for line in table] == ["tumour.volume", "113.1", "268.1"]
-    assert all(line.endswith(",") for line in table[1:])  # no case failed
-    assert said.count("warning for tumour.volume = ") == 2
+    for name in ("table", "growth"):
+        table = (out / name / "table.csv").read_text().splitlines()
+        assert [line.split(",")[1] for line in table] == ["tumour.volume", "113.1", "268.1"]
+        assert all(line.endswith(",") for line in table[1:])  # no case failed
+    assert said.count("warning for tumour.volume = ") == 4
 
 
 def test_from_abaqus_decks(tmp_path):
