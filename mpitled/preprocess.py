@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -9,11 +10,11 @@ from numpy.typing import NDArray
 
 from mpitled.deck import Deck, Sphere
 from mpitled.errors import InputError
-from mpitled.loading import growth, turn
+from mpitled.loading import growth, sphere_radius, turn
 from mpitled.material import Material
 from mpitled.mesh import Mesh, Part, named_set
 from mpitled.meshing import block, checks, labels, phantoms
-from mpitled.meshing.cloud import in_sphere
+from mpitled.meshing.cloud import in_sphere, length
 from mpitled.meshing.mapping import carry_over
 from mpitled.model import Model
 from mpitled.solver import hexahedra, support
@@ -22,11 +23,18 @@ from mpitled.solver import hexahedra, support
 TUMOUR = "tumour"
 #: Node sets of the outer surface: no constant stress is in balance there without the tractions.
 OUTER = ("skull", "surface")
+#: Radius of a tumour over its seed's up to which clouds are known to complete, and a little (jobs/studies/README.md).
+GREATEST_GROWTH = 8.0
 
 
 def read_mesh(deck: Deck) -> Mesh:
     """The mesh of a deck's one geometry section, with the cell sets of its spheres."""
-    mesh = _geometry(deck)
+    try:
+        mesh = _geometry(deck)
+    except InputError as error:
+        if deck.mesh:  # what is wrong is in other files
+            raise
+        raise InputError(f"{deck.path}: {error}") from None
     if not deck.spheres:
         return mesh
     middles = np.concatenate([mesh.points[mesh.hexahedra].mean(axis=1), mesh.integration_points])
@@ -145,8 +153,25 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
         cell_sets=mesh.cell_sets,
         surface_areas=mesh.surface_areas,
         figures=figures,
-        remarks=(*mesh.remarks, *checks.scene_remarks(points, mesh.hexahedra, domains, n_fe_nodes, dofs)),
+        remarks=(
+            *mesh.remarks,
+            *checks.scene_remarks(points, mesh.hexahedra, domains, n_fe_nodes, dofs),
+            *(_growth_remarks(deck) if len(domains) else ()),
+        ),
     )
+
+
+def _growth_remarks(deck: Deck) -> Iterator[str]:
+    """Warnings of a tumour that a cloud is not known to take."""
+    if deck.tumour is None:
+        return
+    radius, seed = sphere_radius(deck.tumour.volume), deck.tumour.seed_radius
+    grows = f"warning: the tumour grows to a radius of {length(radius)}"
+    if radius > GREATEST_GROWTH * seed:
+        times = f"{radius / seed:.3g} times its seed's"
+        yield f"{grows}, {times}, where cells may turn inside out; enlarge tumour.seed_radius"
+    if radius > deck.cloud.radius and not deck.mesh:
+        yield f"{grows}, beyond the cloud's {length(deck.cloud.radius)}; enlarge cloud.radius"
 
 
 def _domains(deck: Deck, mesh: Mesh, material: NDArray[np.int16]) -> tuple[NDArray[np.int64], dict[str, float]]:

@@ -181,8 +181,10 @@ def test_cloud_of_a_block_is_irregular_and_follows_its_spacing():
     ("centre", "radius", "message"),
     [
         ((0.02, 0.02, 0.0202), 0.0001, "cloud: no hexahedron"),
-        ((0.02, 0.02, 0.02), 0.006, "hexahedra smaller"),
-        ((0.021, 0.021, -0.001), 0.01, "not inside the cloud"),
+        ((0.02, 0.02, 0.02), 0.006, "need 6 mm; enlarge cloud.radius, or make the hexahedra smaller"),
+        ((0.021, 0.021, 0.003), 0.011, "is 3 mm from .* move it away from there, or make the hexahedra smaller"),
+        ((0.021, 0.021, 0.0), 0.011, "is 0 mm from"),
+        ((0.021, 0.021, -0.001), 0.01, "not inside the cloud, but 1 mm from it; move it"),
     ],
 )
 def test_a_seed_without_room_is_refused(centre, radius, message):

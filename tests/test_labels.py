@@ -303,10 +303,11 @@ def test_files_that_are_no_image(tmp_path):
 @pytest.mark.parametrize(
     ("centre", "message"),
     [
-        ((0.5, 0.0, 0.0), "outside the brain"),
+        # The ellipsoid ends at x = 37 mm, and a cube's edge is 4 mm.
+        ((0.5, -0.005, 0.007), r"outside the brain, 46[1-7](\.\d)? mm from the nearest tissue"),
         ((0.003, 0.0362, 0.007), "room|outside"),
         ((-0.0035, -0.005, 0.007), "in the left ventricle"),
-        ((0.003, -0.043, 0.007), "so near to the skull|around it need"),
+        ((0.003, -0.043, 0.007), "so near to the skull|outer surface or a ventricle"),
     ],
 )
 def test_a_tumour_that_does_not_lie_in_tissue_is_refused(tmp_path, centre, message):
@@ -325,6 +326,7 @@ def test_a_tumour_that_does_not_lie_in_tissue_is_refused(tmp_path, centre, messa
         ({"size": 0.03}, "make it smaller"),
         ({"tissue": ()}, "labels.tissue names no label"),
         ({"right_ventricle": (41,)}, "given twice"),
+        ({"left_ventricle": (5, 44)}, r"label 44 \(labels.left_ventricle\) is not in it; leave it out, .* 5, 7, 41$"),
     ],
 )
 def test_labels_section_that_cannot_be_met(tmp_path, keys, message):

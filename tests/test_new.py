@@ -7,6 +7,7 @@ import re
 
 import pytest
 from conftest import ROOT, complaint, mpitled
+from scenes import TUMOUR
 
 from mpitled import scaffold
 from mpitled.arguments import KINDS
@@ -120,3 +121,23 @@ def test_a_slip_of_the_unit_that_is_possible_is_a_warning(tmp_path):
 def test_a_wrong_deck_ends_the_command_with_status_2(tmp_path):
     old, new, culprit, _ = MISTAKES["negative volume"]
     assert culprit in complaint(mpitled("check", wrong(tmp_path, old, new), "--json", status=2))
+
+
+def test_a_tumour_that_no_cloud_is_known_to_take_is_warned_of(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(TUMOUR)
+    for keys, words in (
+        ([], []),
+        (["tumour.volume=7240"], ["12 mm, beyond the cloud's 11 mm; enlarge cloud.radius"]),
+        (["tumour.volume=3054", "tumour.seed_radius=1.0"], ["9 mm, 9 times its seed's, .* enlarge tumour.seed_radius"]),
+    ):
+        remarks = overview.figures(path, keys)["remarks"]
+        assert len(remarks) == len(words)
+        for remark, word in zip(remarks, words, strict=True):
+            assert re.search(word, remark)
+
+
+def test_a_tumour_in_the_wrong_place_is_said_with_the_deck(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(TUMOUR.replace("[24.0, 20.0, 20.0]", "[24.0, 20.0, 3.0]"))
+    assert f"{path}: tumour.centre = (24, 20, 3) mm: is 3 mm from" in complaint(mpitled("check", path, status=2))

@@ -124,7 +124,7 @@ def fill_void(
     boundary = boundary_faces(hexahedra[dropped])
     seed, spacing = _seed(cloud, tumour, element_size)
     if tumour is not None:
-        _check_room(points[boundary], tumour, element_size)
+        _check_room(points[boundary], tumour, element_size, cloud.radius)
 
     void = float(volumes_and_centroids(corners)[0].sum())
     _check_size(corners, void, spacing, cloud.points_per_spacing)
@@ -416,8 +416,16 @@ def in_millimetres(place: NDArray[np.float64]) -> str:
     return "(" + ", ".join(f"{1e3 * x:g}" for x in place) + ") mm"
 
 
-def _check_room(boundary: NDArray[np.float64], tumour: deck.Tumour, element_size: float) -> None:
-    """The seed lies inside the void's boundary (n, 4, 3), with an element's size of cloud around it."""
+def length(metres: float) -> str:
+    """A length for people to read: in mm, to a hundredth at the best."""
+    return f"{round(1e3 * metres, 2):.3g} mm"
+
+
+def _check_room(boundary: NDArray[np.float64], tumour: deck.Tumour, element_size: float, radius: float) -> None:
+    """The seed lies inside the void's boundary (n, 4, 3), with an element's size of cloud around it.
+
+    radius: cloud.radius; hexahedra with their middles within it are replaced, where there are any that can be.
+    """
     quads = boundary - np.asarray(tumour.centre, float)
     where = f"tumour.centre = {in_millimetres(np.asarray(tumour.centre, float))}"
     # Solid angles of a closed surface sum to 4 pi for a point inside, to 0 outside (van Oosterom and Strackee 1983).
@@ -425,18 +433,22 @@ def _check_room(boundary: NDArray[np.float64], tumour: deck.Tumour, element_size
     la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     denominator = la * lb * lc + (a * b).sum(1) * lc + (b * c).sum(1) * la + (c * a).sum(1) * lb
     solid_angle = 2 * np.arctan2((a * np.cross(b, c)).sum(1), denominator).sum()
-    if solid_angle < 2 * np.pi:
-        raise InputError(f"{where}: is not inside the cloud; move it")
     s = np.linspace(0, 1, 9)
     weights = np.stack(
         [np.outer(1 - s, 1 - s), np.outer(s, 1 - s), np.outer(s, s), np.outer(1 - s, s)], axis=-1
     ).reshape(-1, 4)
     room = min(np.linalg.norm(quads.transpose(0, 2, 1) @ w, axis=1).min() for w in weights)
+    if solid_angle < 2 * np.pi:
+        raise InputError(f"{where}: is not inside the cloud, but {length(room)} from it; move it")
     needed = tumour.seed_radius + element_size
     if room < needed:
+        # Next to the boundary is a hexahedron whose middle is not within the radius; or there is none, or it must stay.
+        remedy = "enlarge cloud.radius"
+        if room + element_size < radius:
+            remedy = "the outer surface or a ventricle is too near, whatever cloud.radius: move it away from there"
         raise InputError(
-            f"{where}: is {1e3 * room:.3g} mm from the cloud's boundary, but the seed and an element's size of cloud "
-            f"around it need {1e3 * needed:.3g} mm; move it, enlarge cloud.radius, or make the hexahedra smaller"
+            f"{where}: is {length(room)} from the cloud's boundary, but the seed and an element's size of cloud "
+            f"around it need {length(needed)}; {remedy}, or make the hexahedra smaller"
         )
 
 

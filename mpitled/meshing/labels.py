@@ -17,7 +17,7 @@ from scipy import ndimage
 from mpitled import room
 from mpitled.errors import InputError
 from mpitled.mesh import CORNERS, Mesh, Part, check_size
-from mpitled.meshing.cloud import fill_void, in_millimetres
+from mpitled.meshing.cloud import fill_void, in_millimetres, length
 
 if TYPE_CHECKING:
     from mpitled import deck
@@ -267,8 +267,9 @@ def solid_cells(share: NDArray[np.float64]) -> tuple[Cells, int]:
 def _voxels(image: Image, name: str, numbers: Sequence[int]) -> Cells:
     missing = [str(n) for n in numbers if not (image.labels == n).any()]
     if missing:
-        there = ", ".join(map(str, np.unique(image.labels)[:20]))
-        raise InputError(f"{image.path}: label {', '.join(missing)} (labels.{name}) is not in it; labels: {there}")
+        there = ", ".join(map(str, np.unique(image.labels[image.labels > 0])[:20]))
+        what = f"label {', '.join(missing)} (labels.{name}) is not in it"
+        raise InputError(f"{image.path}: {what}; leave it out, or name one of {there}")
     return np.isin(image.labels, numbers)
 
 
@@ -398,6 +399,13 @@ def _connected_part(share: NDArray[np.float64], target: int) -> Cells:
     return part
 
 
+def _distance(grid: Grid, cells: Cells, place: NDArray[np.float64]) -> str:
+    """How far a place (3,), m, is from the nearest of the cubes, in mm."""
+    low = grid.origin + grid.size * np.argwhere(cells)[:, ::-1]
+    apart = np.maximum(np.maximum(low - place, place - low - grid.size), 0.0)
+    return length(float(np.linalg.norm(apart, axis=1).min()))
+
+
 def _void(head: Head, radius: float, centre: NDArray[np.float64]) -> Cells:
     """Cubes of tissue within the radius of the tumour's centre that make room for the cloud: one piece around it.
 
@@ -407,12 +415,14 @@ def _void(head: Head, radius: float, centre: NDArray[np.float64]) -> Cells:
     grid, parts = head.grid, head.parts
     cell = grid.cell_of(centre)
     part = next((name for name, cells in parts.items() if cell is not None and cells[cell]), None)
-    if part is None:
+    if part != "tissue":
+        lies = f"in the {part.replace('_', ' ')}" if part else "outside the brain"
+        apart = _distance(grid, parts["tissue"], centre)
         low, high = (1e3 * (grid.origin + grid.size * np.array(end)) for end in ((0, 0, 0), grid.shape))
         extent = ", ".join(f"{name} {a:.0f} to {b:.0f}" for name, a, b in zip("xyz", low, high, strict=True))
-        raise InputError(f"{where}: lies outside the brain (within {extent} mm); move it into tissue")
-    if part != "tissue":
-        raise InputError(f"{where}: lies in the {part.replace('_', ' ')}; move it into tissue")
+        raise InputError(
+            f"{where}: lies {lies}, {apart} from the nearest tissue; move it into tissue (the head: {extent} mm)"
+        )
     away = [(grid.origin[i] + grid.size * (np.arange(grid.shape[i]) + 0.5) - centre[i]) ** 2 for i in (2, 1, 0)]
     square_distance = away[0][:, None, None] + away[1][:, None] + away[2]
     free = parts["tissue"] & head.deep
