@@ -201,9 +201,9 @@ def _domains(deck: Deck, mesh: Mesh, material: NDArray[np.int16]) -> tuple[NDArr
                 )
                 repaired = support.repair(points, places, found.domains, options.basis, options.weight, some)
                 break
-            except InputError:
+            except InputError as error:
                 if len(nodes) == mesh.n_nodes:
-                    raise
+                    raise InputError(f"{deck.path}: {error}") from None
         of_parts.append((part.integration_points, nodes[found.domains]))
         across = not may[nodes].all()
         counts = (found.limited, found.added, repaired, across * len(places))

@@ -230,7 +230,7 @@ def test_a_deck_that_asks_for_too_much_is_refused_before_it_is_made(tmp_path, ke
     deck = tmp_path / "deck.toml"
     deck.write_text(SCENE.format(geometry=LARGE[key]))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    refused(deck, rf"^{key}.*(of memory, and|is more than)", lambda path: build(load_deck(path)))
+    refused(deck, rf"^{deck}: {key}.*(of memory, and|is more than)", lambda path: build(load_deck(path)))
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1 << 16  # KiB
 
 
