@@ -19,7 +19,7 @@ def test_from_a_segmentation_to_a_table(segmentation):
         table = (out / name / "table.csv").read_text().splitlines()
         assert [line.split(",")[1] for line in table] == ["tumour.volume", "113.1", "268.1"]
         assert all(line.endswith(",") for line in table[1:])  # no case failed
-    assert said.count("warning for tumour.volume = ") == 4
+    assert said.count("warning for tumour.volume = ") == 2  # one of each
 
 
 def test_from_abaqus_decks(tmp_path):
