@@ -217,3 +217,29 @@ def test_a_stiffer_mode_that_comes_up_elsewhere_is_found(tmp_path):
     (tmp_path / "scene.toml").write_text(deck)
     report = job.run(load_deck(tmp_path / "scene.toml"), tmp_path, World(), quiet=True)
     assert report["min_jacobian"] > 0.8
+
+
+@pytest.mark.parametrize("kind", ["quasi-static", "dynamic", "relaxation"])
+def test_the_iteration_leaves_the_forces_of_the_displacements(tmp_path, kind):
+    """To the bit: a run that is continued begins with forces made anew."""
+    deck, sub, figures = subdomain(
+        tmp_path, BLOCK.format(size=[30.0] * 3, cloud="core") + TISSUE.format(nu=0.49, fixed="z0"), 0.1
+    )
+    if kind == "relaxation":
+        method = Relaxation(replace(deck.solver, method=kind), 1, sub, World(), None, None)
+    else:
+        method = March(replace(deck.solver, method=kind), 1, sub, World(), None, None, figures)
+    method.begin()
+    s = method.state
+    s.place(np.random.default_rng(0).normal(scale=1e-14, size=(3, sub.n_nodes)))  # m: smaller than what is tried
+    for _, term in method.forces:
+        term(s)
+    before = s.u.copy()
+    method.sharpness.wait = 0
+    method.look()
+    assert not np.array_equal(s.u, before)  # it was tried in place
+    left = s.f.copy()
+    s.f[:] = 0
+    for _, term in method.forces:
+        term(s)
+    assert np.array_equal(s.f, left)
