@@ -19,9 +19,12 @@ from mpitled.solver.step import State, at_rest, compose_forces, compose_march, r
 from mpitled.solver.subdomain import Subdomain
 from mpitled.solver.survey import Survey
 
-#: The cells are surveyed at least so many times in a run, and at least once in so many steps: a survey takes about the
-#: time of one step and a half, below 2 % of a long run.
-SURVEYS, LONGEST_UNWATCHED = 100, 80
+#: Surveys of a run where what is stable changes fast, and where it does not; and the most steps from one to the next. A
+#: survey takes about the time of one step and a half.
+MANY, FEW, LONGEST_UNWATCHED = 100, 20, 100
+#: Where a step still stable has shrunk since the last survey by less than the first, the next ones come half as often;
+#: by more than the second, which `solver.safety` leaves room for, twice as often.
+CALM, HASTY = 1.03, 1.1
 #: More steps than that nobody waits for: they come of a slip in the units of a density or a modulus.
 MOST_STEPS = 1e8
 #: A step that was shortened grows again when it could be longer by this factor.
@@ -37,7 +40,7 @@ class March:
 
     #: Beside the state: what an unstable run goes back to, and what stays as it is when it does.
     PASSING = Kept(sums=("added_mass", "added_energy"), alike=("frame",))
-    LASTING = Kept(alike=("safety", "longest", "between"))
+    LASTING = Kept(alike=("safety", "longest", "between", "interval", "shortest_interval", "longest_interval"))
     #: What it goes back to, of itself and of the state.
     HEALTHY = (PASSING, State.KEPT)
 
@@ -57,7 +60,7 @@ class March:
         self.scales_mass = solver.mass_scaling and solver.method == "quasi-static"
         self.typical = model["critical_step_typical_s"]  # by the bound
         self.end = solver.load_time + solver.hold_time
-        self.frame_span = self.end / frames
+        self.frames, self.frame_span = frames, self.end / frames
         self.frame = 0
         self.state = at_rest(sub, solver.load_time, 1.0)
         self.survey = Survey(sub)
@@ -65,7 +68,9 @@ class March:
         nodes, directions = np.unique(self.held // 3, return_counts=True)
         self.prescribed: NDArray[np.int64] = nodes[directions == 3].astype(np.int64)  # need no mass for stability
         self.added_mass, self.added_energy = 0.0, 0.0
-        self.longest, self.between = math.inf, 1  # found by `begin`
+        self.longest, self.between = math.inf, 1  # found by `begin`, as is how many steps a survey lasts
+        # at most. Fewer are taken, `between`, so that surveys fill a frame.
+        self.interval, self.shortest_interval, self.longest_interval = 1, 1, 1
         self.forces, self.motion = compose_forces(sub, force_halo), compose_march(sub)
         self.sharpness = Sharpness(sub, world, self.forces, sub.free())
 
@@ -95,16 +100,25 @@ class March:
                 f"solver.load_time = {solver.load_time:g}: takes {self.end / self.longest:.2g} steps of "
                 f"{self.longest:.2g} s; check the units of densities and moduli, or shorten it"
             )
-        self.between = int(min(LONGEST_UNWATCHED, max(1, self.end / self.longest // SURVEYS)))
+        shortest, longest = (int(min(LONGEST_UNWATCHED, max(1, self.end / self.longest // n))) for n in (MANY, FEW))
+        self.interval = self.shortest_interval = shortest
+        # Where a wave may run, one survey does not tell of the next.
+        self.longest_interval = longest if self.solver.method == "quasi-static" else shortest
         s.time_step = self._fitting(self.longest, self.frame_span)
         np.divide(s.time_step**2, s.mass, out=s.mobility)
+        if self.scales_mass:
+            required *= s.time_step**2
+            self._raise_mass(required)
 
     def _largest(self, value: float) -> float:
         return float(self.world.gather([value]).max())
 
     def _fitting(self, longest: float, span: float) -> float:
-        """The longest step, none longer than that, of which whole surveys fill the span."""
-        return span / (self.between * math.ceil(span / (longest * self.between) * (1 - 1e-9)))
+        """The longest step, none longer than that, of which whole surveys fill the span; renews `between`."""
+        steps = math.ceil(span / longest * (1 - 1e-9))
+        surveys = math.ceil(steps / self.interval)
+        self.between = math.ceil(steps / surveys)
+        return span / (self.between * surveys)
 
     @property
     def frame_time(self) -> float:
@@ -115,6 +129,12 @@ class March:
     def expected_steps(self) -> int:
         """Steps of the whole run, if the step stays what it is."""
         return round(self.end / self.state.time_step)
+
+    @property
+    def expected_surveys(self) -> int:
+        """Surveys of the whole run, if what is stable changes slowly."""
+        denser = math.ceil(math.log2(self.longest_interval / self.interval))
+        return denser + max(self.frames, math.ceil(self.expected_steps / self.longest_interval))
 
     @property
     def progress(self) -> float:
@@ -135,7 +155,8 @@ class March:
         """This rank's share of the figures at the present time, for which the forces are there.
 
         Sums, in J: "external", "strain", "hourglass", "stabilisation", "kinetic", "added", "dissipated"; in kg:
-        "added_mass". Extremes: "min_jacobian" (of all steps), "step_ratio": the step over the one proved stable.
+        "added_mass". Extremes: "min_jacobian" (of all steps), "step_ratio": the steps since the last survey over the
+        one that this survey proves stable.
         """
         s, owned = self.state, self.sub.rows.owned
         found = self.survey.look(s, self.safety)
@@ -143,16 +164,21 @@ class March:
         found["kinetic"] = kernels.kinetic_energy(s.u, s.u_prev, s.f, s.mass, s.mobility, owned, self.held, s.time_step)
         found["step_ratio"] = self.safety * float(np.sqrt((required / s.mass).max()))
         if self.scales_mass:
-            mass, energy = kernels.raise_mass(s.u, s.u_prev, s.mass, s.mobility, required, owned, s.time_step)
-            self.added_mass += mass
-            self.added_energy += energy
-            found["step_ratio"] = min(found["step_ratio"], self.safety)
+            self._raise_mass(required)
         return found | {
             "external": s.external_work,
             "added": self.added_energy,
             "added_mass": self.added_mass,
             "dissipated": 0.0,
         }
+
+    def _raise_mass(self, required: NDArray[np.float64]) -> None:
+        s = self.state
+        mass, energy = kernels.raise_mass(
+            s.u, s.u_prev, s.mass, s.mobility, required, self.sub.rows.owned, s.time_step
+        )
+        self.added_mass += mass
+        self.added_energy += energy
 
     def _required(self) -> NDArray[np.float64]:
         """Mass (kg) that each node needs after a survey, on all ranks; renews now and then how sharp its bound is."""
@@ -179,8 +205,15 @@ class March:
             self.frame += 1
         if s.time >= self.end - 0.5 * s.time_step:
             return due, True
-        allowed = min(self.longest, s.time_step * self.safety / figures["step_ratio"])
-        if due or allowed < s.time_step or allowed > REGAIN * s.time_step:
+        shrunk = figures["step_ratio"] / self.safety
+        allowed = self.longest if self.scales_mass else min(self.longest, s.time_step / shrunk)
+        longer = False
+        if shrunk > HASTY:
+            self.interval = max(self.shortest_interval, self.interval // 2)
+        elif longer := shrunk < CALM and self.interval < self.longest_interval:
+            self.interval = min(self.longest_interval, 2 * self.interval)
+        fits = not longer and self.between <= self.interval and s.time_step <= allowed <= REGAIN * s.time_step
+        if due or not fits:
             self._take(self._fitting(allowed, self.frame * self.frame_span - s.time))
         return due, False
 
@@ -189,7 +222,7 @@ class March:
         self.safety /= math.sqrt(2)
         if not self.scales_mass:
             self.longest /= math.sqrt(2)
-        self.between = max(1, self.between // 2)
+        self.interval = self.shortest_interval = max(1, self.shortest_interval // 2)
 
     def _take(self, time_step: float) -> None:
         s = self.state

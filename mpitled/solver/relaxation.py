@@ -134,6 +134,11 @@ class Relaxation:
         return round(self.load_time)
 
     @property
+    def expected_surveys(self) -> int:
+        """Surveys of these steps."""
+        return math.ceil(self.expected_steps / self.between)
+
+    @property
     def progress(self) -> float:
         """Share of the run that is done, as far as one can tell: half for the load, half for what follows."""
         s = self.state

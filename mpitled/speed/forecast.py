@@ -57,8 +57,8 @@ def measure(method: March | Relaxation) -> tuple[dict[str, float], float]:
 
 def expect(method: March | Relaxation, step: float, survey: float, output_bytes: int) -> Forecast:
     """What a method that is ready to begin will take, at so many seconds a step and a survey."""
-    n = method.expected_steps
-    return Forecast(n, math.ceil(n / method.between), isinstance(method, Relaxation), step, survey, output_bytes)
+    at_least = isinstance(method, Relaxation)
+    return Forecast(method.expected_steps, method.expected_surveys, at_least, step, survey, output_bytes)
 
 
 def forecast(deck: Deck, model: Model) -> Forecast:
