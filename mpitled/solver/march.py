@@ -174,9 +174,7 @@ class March:
 
     def _raise_mass(self, required: NDArray[np.float64]) -> None:
         s = self.state
-        mass, energy = kernels.raise_mass(
-            s.u, s.u_prev, s.mass, s.mobility, required, self.sub.rows.owned, s.time_step
-        )
+        mass, energy = kernels.raise_mass(s.u, s.u_prev, s.mass, s.mobility, required, self.sub.rows.owned, s.time_step)
         self.added_mass += mass
         self.added_energy += energy
 
