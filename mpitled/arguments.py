@@ -61,7 +61,7 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
 
     new = command("new", "write a deck with comments to begin with")
     new.add_argument("kind", choices=KINDS, help="geometry: a label image, mesh files, or a shape")
-    new.add_argument("file", type=Path, nargs="?", help="the deck that is written (KIND.toml)")
+    new.add_argument("file", type=Path, nargs="?", help="the deck that is written (KIND.toml); -: standard output")
 
     check = command("check", "check a mesh file or a deck, and say what is in it and what it will take", json=True)
     check.add_argument("file", type=Path, help="a mesh (Abaqus, LS-DYNA, or what meshio reads), or a deck (TOML)")
