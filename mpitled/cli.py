@@ -109,7 +109,7 @@ def _run(options: argparse.Namespace) -> None:
     if options.dry:
         from mpitled.speed.dry import dry_run
 
-        told = dry_run(deck, _output(options), world)
+        told = dry_run(deck, _output(options), world, verbose=options.verbose)
         if world.leads:
             print(told)
         return

@@ -85,7 +85,7 @@ def write(kind: str, path: Path) -> list[Path]:
 
 
 def text(kind: str, path: Path, meshes: Sequence[Path] = ()) -> str:
-    """The deck that is at a path, or would be, with the meshes that it reads. InputError if it reads some, and has none."""
+    """The deck for a path, with the meshes that it reads; InputError if it reads some and there are none."""
     geometry = {}
     if kind == "brain":
         geometry = {"image": os.path.relpath(_IMAGE, path.parent) if _IMAGE.exists() else "labels.nii.gz"}
