@@ -354,17 +354,25 @@ _OUTCOMES = {
 _CELL = (0.82, 0.2)  # inches
 _MARGIN, _HEAD, _WIDTH = 1.5, 0.62, 6.6  # inches left of a panel's cells, above them, and of a panel with both
 _PANELS = 3  # beside one another
+#: What the words of a cell mean.
+_SAID = (
+    "number: largest difference from the reference (a closed form or another run), mm; percentage: share of the load",
+    "completed: it is at most 3 times what run and reference say of themselves, above all how far from rest they are;",
+    "a ramp that is millimetres off completes if it says that it is",
+    "warned: it is more, and was warned of; buckled: more, with less energy than the closed form; wrong: none of these",
+)
 
 
-def draw_matrix(rows: list[dict[str, Any]], path: Path) -> None:
+def draw_matrix(rows: list[dict[str, Any]], path: Path) -> Figure:
     """The stability matrix: a panel for each axis, kinds and methods down, values across, what became of it in words.
 
     Completed runs have their error in mm, stopped ones the share of the load that they had, or that they were refused.
+    Rows may be those of the table, all of whose values are text.
     """
     panels: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
         panels.setdefault(row["axis"], []).append(row)
-    filled = [0.4] * _PANELS  # inches from the top, for the legend first
+    filled = [0.4 + 0.16 * len(_SAID)] * _PANELS  # inches from the top, for the legend first
     places = {}
     for name, cells in panels.items():
         column = filled.index(min(filled))
@@ -378,8 +386,8 @@ def draw_matrix(rows: list[dict[str, Any]], path: Path) -> None:
     axes.axis("off")
     for i, (outcome, (colour, ink)) in enumerate(_OUTCOMES.items()):
         _cell(axes, 0.1 + i * 1.2 * _CELL[0], 0.1, outcome, colour, ink)
-    said = "completed, warned, buckled, wrong: error, mm; stopped: share of the load reached"
-    axes.text(0.1 + 6.1 * _CELL[0], 0.2, said, fontsize=7, va="center", color=_INK)
+    for i, words in enumerate(_SAID):
+        axes.text(0.1, 0.42 + 0.16 * i, words, fontsize=7, va="center", color=_INK)
     for name, (column, top, runs) in places.items():
         left, top = column * _WIDTH + _MARGIN, top + _HEAD
         values = list(dict.fromkeys(cell["value"] for cell in panels[name]))
@@ -395,6 +403,7 @@ def draw_matrix(rows: list[dict[str, Any]], path: Path) -> None:
             colours = _OUTCOMES[cell["outcome"]]
             _cell(axes, left + i * _CELL[0], top + j * _CELL[1], _words(cell), *colours)
     figure.savefig(path, dpi=150)
+    return figure
 
 
 def _cell(axes: Any, x: float, y: float, text: str, colour: str, ink: str) -> None:
@@ -408,4 +417,8 @@ def _words(cell: dict[str, Any]) -> str:
     if cell["error_mm"] != "":
         return f"{float(cell['error_mm']):.2g}"
     reached = re.search(r"unstable at ([\d.]+%)", cell["message"])
-    return reached[1] if reached else {3: "stalled", 2: "refused", 0: "error unsaid"}.get(cell["status"], "no end")
+    return (
+        reached[1]
+        if reached
+        else {"3": "stalled", "2": "refused", "0": "error unsaid"}.get(str(cell["status"]), "no end")
+    )
