@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -164,18 +165,27 @@ def test_an_array_job_computes_each_task_alone(tmp_path, monkeypatch):
     assert mpitled("report", out).stdout.count("not computed") == 1
 
 
-def test_a_task_of_an_array_ends_in_order_before_its_time_is_up(tmp_path, monkeypatch):
+@pytest.mark.parametrize("scheduler", ["slurm", "pbs"])
+def test_a_task_of_an_array_ends_in_order_before_its_time_is_up(tmp_path, monkeypatch, scheduler):
+    """SLURM sends a signal; PBS sends none in time, so that the script has a clock."""
     monkeypatch.chdir(tmp_path)
     deck, out = tmp_path / "scene.toml", tmp_path / "out"
     deck.write_text(GROWTH)
-    script, variables = array_job(tmp_path, deck, ["solver.load_time=50"], "tumour.volume=150", "slurm")
-    variables |= {"SLURM_ARRAY_TASK_ID": "1"}
+    script, variables = array_job(tmp_path, deck, ["solver.load_time=50"], "tumour.volume=150", scheduler)
+    hours, minutes, seconds = map(
+        int, re.search(r"(?:time|walltime)=(\d+):(\d+):(\d+)$", script.read_text(), re.M).groups()
+    )
+    if scheduler == "pbs":
+        (clock,) = re.findall(r"RUN_SECONDS:-(\d+)", script.read_text())
+        assert int(clock) == 3600 * hours + 60 * minutes + seconds - 120
+    variables |= {"SLURM_ARRAY_TASK_ID": "1", "RUN_SECONDS": "10"}
     with subprocess.Popen([script], env=variables, stderr=subprocess.PIPE, text=True) as process:
         deadline = time.time() + 60
         while not list(out.glob("*/result.partial.vtkhdf")) and time.time() < deadline:
             time.sleep(0.02)
         time.sleep(0.5)
-        process.send_signal(signal.SIGUSR1)
+        if scheduler == "slurm":
+            process.send_signal(signal.SIGUSR1)
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 4, errors
     assert list(out.glob("*/checkpoint.h5"))

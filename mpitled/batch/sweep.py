@@ -254,7 +254,11 @@ def array_job(sweep: Sweep, scheduler: str) -> Path:
     else:
         head = [f"#PBS -l select=1:ncpus={ranks}:mpiprocs={ranks}", "#PBS -l walltime=01:00:00", f"#PBS -o {folder}"]
         head += [f"#PBS -J 1-{n}"] if n > 1 else []  # PBS refuses arrays of one
-        body = [f'mpirun -n {ranks} {words} "${{PBS_ARRAY_INDEX:-1}}"']
+        body = [
+            "# Two minutes less than the walltime, in seconds: PBS gives no notice.",
+            'timeout --signal=USR1 --preserve-status "${RUN_SECONDS:-3480}" \\',
+            f'    mpirun -n {ranks} {words} "${{PBS_ARRAY_INDEX:-1}}"',
+        ]
     script = [
         "#!/usr/bin/env bash",
         *head,
