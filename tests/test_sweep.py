@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 import pytest
 from conftest import ENVIRONMENT, ROOT, complaint, mpitled
-from scenes import TUMOUR
+from scenes import TUMOUR, block, pulled
 
 from mpitled import open_sweep
 from mpitled.batch import cases, screen, summary, vary
@@ -266,6 +266,37 @@ def test_two_sweeps_do_not_work_in_one_folder(tmp_path):
         fcntl.flock(held, fcntl.LOCK_EX)
         done = mpitled("sweep", CUBE, "--vary", "solver.load_steps=5", "--out", tmp_path / "out", status=2)
     assert "another sweep is at work" in done.stderr
+
+
+def test_another_sweep_does_not_take_the_place_of_a_table(tmp_path):
+    """The same goes on and takes more values in; a study alike."""
+    deck, out = tmp_path / "scene.toml", tmp_path / "out"
+    text = f"{block((20, 20, 20), (2, 2, 2))}{pulled(0.1)}"
+    deck.write_text(text)
+    nu = "material.brain.poissons_ratio"
+    for command, table in (("sweep", "table.csv"), ("study", "study.csv")):
+        words = [command, deck, "--out", out / command, "--set", "solver.load_steps=60"]
+        for values in ("0.3,0.4", "0.3,0.4", "0.45,0.4,0.3"):
+            mpitled(*words, "--vary", f"{nu}={values}")
+        kept = (out / command / table).read_bytes()
+        for others, why in (
+            ([*words, "--vary", f"{nu}=0.3,0.45"], f"with {nu}=0.4;"),
+            ([*words, "--vary", "hexahedra.hourglass=0.01"], f"over {nu};"),
+            ([*words, "--set", "solver.tolerance=0.1", "--vary", f"{nu}=0.3"], "with --set solver.load_steps=60;"),
+        ):
+            line = complaint(mpitled(*others, status=2))
+            assert f"holds the table of another {command}, {why}" in line
+            assert f"remove {out / command / command}.json to replace it" in line
+        deck.write_text(text.replace("3000", "4000"))
+        line = complaint(mpitled(*words, "--vary", f"{nu}=0.3,0.4,0.45", status=2))
+        assert "of the deck before it or a file that it reads was changed" in line
+        if command == "sweep":
+            assert "was changed since" in complaint(mpitled("report", out / "sweep", status=2))
+        deck.write_text(text)
+        assert (out / command / table).read_bytes() == kept
+        (out / command / f"{command}.json").unlink()
+        mpitled(*words, "--vary", f"{nu}=0.3")
+        assert (out / command / table).read_bytes().count(b"\n") < kept.count(b"\n")
 
 
 GROWTH = f"""{TUMOUR}
