@@ -31,10 +31,17 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
 
     run = command("run", "compute a deck; on N ranks: mpirun -n N mpitled run DECK", json=True)
     _deck(run)
-    run.add_argument("-v", "--verbose", action="store_true", help="also each phase as it begins, with its rank")
+    run.add_argument(
+        "-v",
+        "--verbose",
+        action="store_true",
+        help="also each phase as it begins, with its rank; of --dry, every array",
+    )
     run.add_argument("-q", "--quiet", action="store_true", help="no progress and no table")
     run.add_argument("--resume", action="store_true", help="go on from the last checkpoint; from the start without one")
-    run.add_argument("--dry", action="store_true", help="say what would be done, and how long it would take; no step")
+    run.add_argument(
+        "--dry", action="store_true", help="say how long it would take, and what would be done (-v: in full); no step"
+    )
 
     sweep = command("sweep", "a table over values of keys, a run for each; goes on where it was stopped", json=True)
     _deck(sweep, "the scene, or the folder of a sweep that goes on")
@@ -61,7 +68,7 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
 
     new = command("new", "write a deck with comments to begin with")
     new.add_argument("kind", choices=KINDS, help="geometry: a label image, mesh files, or a shape")
-    new.add_argument("file", type=Path, nargs="?", help="the deck that is written (KIND.toml)")
+    new.add_argument("file", type=Path, nargs="?", help="the deck that is written (KIND.toml); -: standard output")
 
     check = command("check", "check a mesh file or a deck, and say what is in it and what it will take", json=True)
     check.add_argument("file", type=Path, help="a mesh (Abaqus, LS-DYNA, or what meshio reads), or a deck (TOML)")

@@ -109,7 +109,7 @@ def _run(options: argparse.Namespace) -> None:
     if options.dry:
         from mpitled.speed.dry import dry_run
 
-        told = dry_run(deck, _output(options), world)
+        told = dry_run(deck, _output(options), world, verbose=options.verbose)
         if world.leads:
             print(told)
         return
@@ -174,8 +174,12 @@ def _tabulate(plan: Sweep, options: argparse.Namespace) -> int:
 def _new(options: argparse.Namespace) -> None:
     from mpitled import scaffold
 
-    for path in scaffold.write(options.kind, options.file or Path(f"{options.kind}.toml")):
-        print(path)
+    path = Path(f"{options.kind}.toml")
+    if options.file == Path("-"):
+        print(scaffold.text(options.kind, path), end="")
+        return
+    for written in scaffold.write(options.kind, options.file or path):
+        print(written)
 
 
 def _build(options: argparse.Namespace) -> None:

@@ -77,7 +77,7 @@ def _in_unit(value: Any, unit: str) -> Any:
 class Labels:
     """Geometry: hexahedra made from a label image (0 is outside)."""
 
-    image: Path = key("NIfTI label image; relative to the deck's folder")
+    image: Path = key("label image (NIfTI or MGH); relative to the deck's folder")
     element_size: float = key("edge of a hexahedron", 4.0, "mm", "(0, inf)")
     tissue: tuple[int, ...] = key("labels of brain tissue", (1,), limits="[1, inf)")
     left_ventricle: tuple[int, ...] = key("labels of the left ventricle", (2,), limits="[1, inf)")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -79,11 +79,19 @@ def write(kind: str, path: Path) -> list[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from None
-    meshes, geometry = [], {}
+    meshes = _meshes(path.with_name(f"{path.stem}_mesh")) if kind == "decks" else []
+    atomic.write_text(path, text(kind, path, meshes))
+    return [path, *meshes]
+
+
+def text(kind: str, path: Path, meshes: Sequence[Path] = ()) -> str:
+    """The deck for a path, with the meshes that it reads; InputError if it reads some and there are none."""
+    geometry = {}
     if kind == "brain":
         geometry = {"image": os.path.relpath(_IMAGE, path.parent) if _IMAGE.exists() else "labels.nii.gz"}
     elif kind == "decks":
-        meshes = _meshes(path.with_name(f"{path.stem}_mesh"))
+        if not meshes:
+            raise InputError("new decks: meshes are written beside the deck; give a file, not -")
         keys = ("fe", "efg", "integration_points", "surface_areas")
         geometry = {key: f"{mesh.parent.name}/{mesh.name}" for key, mesh in zip(keys, meshes, strict=True)}
     (heading, chosen), *others = _SCENES[kind]
@@ -98,8 +106,7 @@ def write(kind: str, path: Path) -> list[Path]:
     ]
     for name, values in scene:
         lines += ["", *_section(name, values)]
-    atomic.write_text(path, "\n".join(lines) + "\n")
-    return [path, *meshes]
+    return "\n".join(lines) + "\n"
 
 
 def _section(heading: str, values: Mapping[str, Any]) -> Iterator[str]:

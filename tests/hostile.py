@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import io
-import json
 import random
 import re
 import shutil
@@ -266,10 +265,11 @@ def readers(scratch: Path) -> dict[str, Reader]:
     table = "x,y,z,ux,uy,uz\n" + "".join(",".join(map(repr, row)) + "\n" for row in numbers.tolist())
     run, model, result, kept = _run(scratch)
     unpack = {".gz": (gzip.decompress, gzip.compress), ".npz": _rezip(bytes)}
-    sweep = {
-        "deck": str(scratch / "run.toml"), "overrides": ["output.pictures=false"], "ranks": 1, "one_growth": False,
-        "cases": [{"number": 1, "folder": "a", "values": {"solver.load_time": "1.0"}}],
-    }  # fmt: skip
+    planned = cases.plan(
+        scratch / "run.toml", [{"solver.load_time": "1.0"}], ["output.pictures=false"], 1, scratch / "sweep"
+    )
+    planned.write_manifest()
+    sweep = (scratch / "sweep" / cases.MANIFEST).read_bytes()
     return {
         "Abaqus decks": Reader(overview.check, {k: v for k, v in decks.items() if "dyna" not in k}),
         "LS-DYNA decks": Reader(overview.check, {k: v for k, v in decks.items() if "dyna" in k}),
@@ -287,7 +287,7 @@ def readers(scratch: Path) -> dict[str, Reader]:
         ),
         "sweep.json": Reader(
             lambda path: cases.read(path.parent),
-            {"sweep": {"sweep.json": json.dumps(sweep).encode()}},
+            {"sweep": {"sweep.json": sweep}},
         ),
         "reference (npz)": Reader(_reference(run), {"npz": {"r.npz": _npz()}}, unpack),
         "reference (CSV)": Reader(_reference(run), {"csv": {"r.csv": table.encode()}}),

@@ -47,7 +47,16 @@ def test_a_dry_run_tells_the_terms_that_the_run_takes_and_takes_no_step(tmp_path
     mpitled(*arguments, "-q", n=ranks)
     report = json.loads((out / "report.json").read_text())
     assert re.findall(r"^  ([a-z ]+), [0-9.]+ ms$", told, re.M) == list(report["term_seconds"])
-    rows = [line.split() for line in told.splitlines()[1 : 1 + ranks]]
+    lines = told.splitlines()
+    assert [line.partition(":")[0] for line in lines[:3]] == [
+        "steps",
+        "loop",
+        "output",
+    ]  # what matters most comes first
+    assert len(lines) < 45
+    table = 1 + next(i for i, line in enumerate(lines) if line.startswith("rank "))
+    rows = [line.split() for line in lines[table : table + ranks]]
+    assert all(float(row[5]) > 50 and float(row[6]) > 50 for row in rows)  # bytes a cell, of a step and held
     assert sum(int(row[1]) for row in rows) == report["cells"]["hexahedra"]
     assert sum(int(row[2]) for row in rows) == report["cells"]["support_domains"]
     steps = int(re.search(r"^steps: (\d+)", told, re.M)[1])
@@ -63,10 +72,15 @@ def test_a_dry_run_tells_the_terms_that_the_run_takes_and_takes_no_step(tmp_path
     if ranks == 1:  # what the result tells of itself
         with open_result(out) as result:
             spared = left_out(out, result.metadata)
-        lines = told.splitlines()
         first = lines.index("left out:") + 1
         assert [f"  {what}" for what in spared] == lines[first : first + len(spared)]
-        assert lines[first + len(spared)].startswith("steps:")
+        assert lines[first + len(spared)].startswith("-v ")
+        long = mpitled(*arguments, "--dry", "-v").stdout
+        for name in kernel_names():
+            short, full = (re.search(rf"\b{name}\b", text.partition("left out:")[0]) for text in (told, long))
+            assert bool(short) == bool(full)
+        assert len(re.findall(r"\d+x\d+ (?:float|uint)", long)) > 10
+        assert not re.search("float64|uint32", told)
 
 
 def test_a_disc_without_room_for_the_result_is_found_before_the_run(tmp_path, monkeypatch):

@@ -6,9 +6,13 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
-from conftest import ENVIRONMENT, ROOT
-from guide import PARTS, follow
+from conftest import ENVIRONMENT, ROOT, mpitled
+from guide import GUIDE, PARTS, follow
+
+from mpitled.deck import load_deck
+from mpitled.speed import overview
 
 
 def test_from_a_segmentation_to_a_table(segmentation):
@@ -20,6 +24,29 @@ def test_from_a_segmentation_to_a_table(segmentation):
         assert [line.split(",")[1] for line in table] == ["tumour.volume", "113.1", "268.1"]
         assert all(line.endswith(",") for line in table[1:])  # no case failed
     assert said.count("warning for tumour.volume = ") == 2  # one of each
+
+
+def test_the_labels_of_freesurfer_give_the_brain_that_they_were_made_of(tmp_path):
+    """The shipped brain with FreeSurfer's numbers for its parts, each of them somewhere."""
+    nibabel = pytest.importorskip("nibabel")
+    (section,) = re.findall(r"^```toml\n(.*?)^```$", GUIDE, re.MULTILINE | re.DOTALL)
+    deck = tmp_path / "head.toml"
+    mpitled("new", "brain", deck)
+    text = deck.read_text()
+    coarse = ("labels.element_size=7", "cloud.growth=0.35")
+    shipped = overview.figures(deck, coarse)
+    image = nibabel.load(load_deck(deck).labels.image)
+    begin = text.index("[labels]")
+    deck.write_text(text[:begin] + section + text[text.index("\n\n", begin) :])
+    (tmp_path / "aseg.mgz").touch()
+    parts, aseg = np.asarray(image.dataobj), np.zeros(image.shape, np.int32)
+    labels = load_deck(deck).labels
+    for part, numbers in enumerate((labels.tissue, labels.left_ventricle, labels.right_ventricle), 1):
+        voxels = np.flatnonzero(parts == part)
+        aseg.flat[voxels] = np.resize(numbers, len(voxels))
+    nibabel.save(nibabel.MGHImage(aseg, image.affine), tmp_path / "aseg.mgz")
+    own = overview.figures(deck, coarse)
+    assert own | {"run": None} == shipped | {"run": None}  # which is measured
 
 
 def test_from_abaqus_decks(tmp_path):

@@ -318,6 +318,23 @@ def test_a_tumour_that_does_not_lie_in_tissue_is_refused(tmp_path, centre, messa
     assert "move it" in str(error.value)
 
 
+def test_a_centre_in_voxels_is_told_in_millimetres(tmp_path):
+    """By the file's own axes, whichever way they run."""
+    path = tmp_path / "turned.nii.gz"
+    original = nibabel.load(DATA / "mni152_labels_2mm.nii.gz")
+    turned = original.as_reoriented(np.array([[1, -1], [2, 1], [0, -1]]))
+    nibabel.save(turned, path)
+    voxel = np.round(np.linalg.inv(turned.affine) @ (-32.0, -20.0, 10.0, 1.0))
+    there = ", ".join(f"{x:g}" for x in (turned.affine @ voxel)[:3])
+    labels = deck.Labels(image=path, element_size=0.006)
+    with pytest.raises(InputError) as error:
+        mesh_labels(labels, deck.Cloud(), tumour(tuple(1e-3 * voxel[:3])))
+    assert str(error.value).endswith(f"; it looks like voxels: in mm it is ({there})")
+    with pytest.raises(InputError) as error:
+        mesh_labels(labels, deck.Cloud(), tumour((0.5, -0.005, 0.007)))
+    assert "voxels" not in str(error.value)
+
+
 @pytest.mark.parametrize(
     ("keys", "message"),
     [

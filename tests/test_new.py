@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 
 import pytest
@@ -43,6 +44,15 @@ def test_a_new_deck_spares_what_is_there(tmp_path):
     assert json.loads(done.stdout)["max_displacement_mm"] == pytest.approx(4, rel=0.01)
     for rank in (0, 1):
         assert f"rank {rank}: loop\n" in done.stderr
+
+
+def test_a_new_deck_goes_to_standard_output(tmp_path):
+    told = mpitled("new", "brain", "-").stdout
+    assert "give a file" in complaint(mpitled("new", "decks", "-", status=2))
+    assert not (ROOT / "-").exists()
+    mpitled("new", "brain", tmp_path / "brain.toml")
+    written = (tmp_path / "brain.toml").read_text().replace(os.path.relpath(ROOT, tmp_path) + "/", "")
+    assert told == written
 
 
 BRAIN = """

@@ -160,6 +160,25 @@ def test_pyvista_draws_what_matplotlib_draws(tmp_path, brain):
     assert dark[0].mean() == pytest.approx(dark[1].mean(), rel=0.1)
 
 
+def test_views_show_the_body_alone_and_say_which_side_is_which(tmp_path, monkeypatch, brain):
+    """The end of the cloud inside of it would look like a crater."""
+    import numpy as np
+    from matplotlib.figure import Figure
+
+    from mpitled.results import views
+    from mpitled.results.solid import solid_of
+
+    outcome, drawn = report.read(brain), []
+    solid = solid_of(outcome.model, outcome.moved)
+    np.testing.assert_array_equal(np.unique(solid.surface), outcome.model.node_sets["skull"])
+    monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: drawn.append(self))
+    views._draw(brain, tmp_path / "views.png", views._painter)
+    for axes in drawn[0].axes[:4]:
+        at = {text.get_text(): text.get_position()[0] for text in axes.texts}
+        assert at["L"] < at["R"]
+    assert "surface of the body" in drawn[0].legends[0].get_texts()[-1].get_text()
+
+
 def test_what_holds_no_run_is_told_apart(tmp_path):
     deck = tmp_path / "scene.toml"
     deck.write_text(CYLINDER)

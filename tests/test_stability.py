@@ -17,6 +17,7 @@ from mpitled.deck import MeshFiles
 from mpitled.material import Material
 from mpitled.model import Model
 from mpitled.readers import meshes
+from mpitled.results import charts
 from mpitled.solver import hexahedra
 
 FEW = extremes.AXES["few"]
@@ -74,6 +75,14 @@ def test_every_outcome_is_told_and_nothing_runs_twice(tmp_path, monkeypatch, cap
     with (tmp_path / "stability.csv").open(newline="") as file:
         assert [row["outcome"] for row in csv.DictReader(file)] == [row["outcome"] for row in rows]
     assert (tmp_path / "stability.png").stat().st_size > 5_000
+    with (tmp_path / "stability.csv").open(newline="") as file:
+        figure = charts.draw_matrix(list(csv.DictReader(file)), tmp_path / "again.png")
+    assert (tmp_path / "again.png").read_bytes() == (tmp_path / "stability.png").read_bytes()
+    words = [text for text in figure.axes[0].texts if "3 times what run and reference say" in text.get_text()]
+    assert len(words) == 1
+    assert stability.TRUE_TO == 3
+    figure.draw_without_rendering()
+    assert all(text.get_window_extent().x1 < figure.bbox.x1 for text in figure.axes[0].texts)
 
 
 @pytest.mark.parametrize(("name", "value", "kind"), [("confined", "-20 %", "mixed"), ("stiff", "1e+06", "FE")])

@@ -270,6 +270,9 @@ def test_vtk_reads_the_same_whatever_the_ranks(model_path: Path, tmp_path: Path,
     assert [p.name for p in tmp_path.iterdir()] == ["result.vtkhdf"]
     times, frames = vtk_frames(tmp_path / "result.vtkhdf")
     assert times == (0.0, 0.25, 0.5, 0.75)
+    with h5py.File(tmp_path / "result.vtkhdf") as file:
+        units = [file[f"VTKHDF/{name}"].attrs["units"] for name in ("Points", "PointData/displacement", "Steps/Values")]
+    assert units == [b"m", b"m", b"s"]
 
     n_hexahedra, n_efg, n_domains = len(model.hexahedra), model.n_nodes - model.n_fe_nodes, len(model.domains)
     whole = store.read_part(model_path, 1, 0)

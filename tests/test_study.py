@@ -5,9 +5,13 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from itertools import combinations
 
 from conftest import ROOT, complaint, mpitled
+from matplotlib.text import Text
 from scenes import TUMOUR
+
+from mpitled.results import charts
 
 CUBE = ROOT / "jobs" / "validation" / "cube.toml"
 REFERENCE = ROOT / "tests" / "data" / "E3_cube_stress_50.npz"
@@ -56,6 +60,25 @@ def test_a_study_goes_on_where_it_stopped_and_tells_errors_and_failures(tmp_path
     again = mpitled(*arguments)
     assert again.stderr.count("/6: ") == 1
     assert removed.exists()
+
+
+def test_names_in_the_picture_do_not_overlap(tmp_path):
+    """Of the kept study, half of whose runs are in one place."""
+    with (ROOT / "jobs" / "studies" / "tumour.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    for row in table:
+        row |= {"loop_s": float(row["loop_s"]), "max_error_mm": float(row["max_error_mm"])}
+        row["pareto"] = row["pareto"] == "True"
+    figure = charts.draw_study(table, tmp_path / "study.png", "largest error, mm")
+    figure.draw_without_rendering()
+    axes = figure.axes[0]
+    assert sorted(text.get_text() for text in axes.texts) == sorted(row["value"] for row in table if row["value"])
+    boxes = [Text.get_window_extent(text) for text in axes.texts]  # without the lines to their points
+    for one, other in combinations(boxes, 2):
+        assert not one.overlaps(other)
+    for box in boxes:
+        assert axes.bbox.x0 < box.x0 < box.x1 < axes.bbox.x1
+        assert axes.bbox.y0 < box.y0 < box.y1 < axes.bbox.y1
 
 
 def test_without_a_reference_runs_are_compared_with_the_one_of_most_work(tmp_path):

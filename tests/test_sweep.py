@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -17,7 +18,7 @@ import h5py
 import numpy as np
 import pytest
 from conftest import ENVIRONMENT, ROOT, complaint, mpitled
-from scenes import TUMOUR
+from scenes import TUMOUR, block, pulled
 
 from mpitled import open_sweep
 from mpitled.batch import cases, screen, summary, vary
@@ -164,18 +165,27 @@ def test_an_array_job_computes_each_task_alone(tmp_path, monkeypatch):
     assert mpitled("report", out).stdout.count("not computed") == 1
 
 
-def test_a_task_of_an_array_ends_in_order_before_its_time_is_up(tmp_path, monkeypatch):
+@pytest.mark.parametrize("scheduler", ["slurm", "pbs"])
+def test_a_task_of_an_array_ends_in_order_before_its_time_is_up(tmp_path, monkeypatch, scheduler):
+    """SLURM sends a signal; PBS sends none in time, so that the script has a clock."""
     monkeypatch.chdir(tmp_path)
     deck, out = tmp_path / "scene.toml", tmp_path / "out"
     deck.write_text(GROWTH)
-    script, variables = array_job(tmp_path, deck, ["solver.load_time=50"], "tumour.volume=150", "slurm")
-    variables |= {"SLURM_ARRAY_TASK_ID": "1"}
+    script, variables = array_job(tmp_path, deck, ["solver.load_time=50"], "tumour.volume=150", scheduler)
+    hours, minutes, seconds = map(
+        int, re.search(r"(?:time|walltime)=(\d+):(\d+):(\d+)$", script.read_text(), re.M).groups()
+    )
+    if scheduler == "pbs":
+        (clock,) = re.findall(r"RUN_SECONDS:-(\d+)", script.read_text())
+        assert int(clock) == 3600 * hours + 60 * minutes + seconds - 120
+    variables |= {"SLURM_ARRAY_TASK_ID": "1", "RUN_SECONDS": "10"}
     with subprocess.Popen([script], env=variables, stderr=subprocess.PIPE, text=True) as process:
         deadline = time.time() + 60
         while not list(out.glob("*/result.partial.vtkhdf")) and time.time() < deadline:
             time.sleep(0.02)
         time.sleep(0.5)
-        process.send_signal(signal.SIGUSR1)
+        if scheduler == "slurm":
+            process.send_signal(signal.SIGUSR1)
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 4, errors
     assert list(out.glob("*/checkpoint.h5"))
@@ -256,6 +266,37 @@ def test_two_sweeps_do_not_work_in_one_folder(tmp_path):
         fcntl.flock(held, fcntl.LOCK_EX)
         done = mpitled("sweep", CUBE, "--vary", "solver.load_steps=5", "--out", tmp_path / "out", status=2)
     assert "another sweep is at work" in done.stderr
+
+
+def test_another_sweep_does_not_take_the_place_of_a_table(tmp_path):
+    """The same goes on and takes more values in; a study alike."""
+    deck, out = tmp_path / "scene.toml", tmp_path / "out"
+    text = f"{block((20, 20, 20), (2, 2, 2))}{pulled(0.1)}"
+    deck.write_text(text)
+    nu = "material.brain.poissons_ratio"
+    for command, table in (("sweep", "table.csv"), ("study", "study.csv")):
+        words = [command, deck, "--out", out / command, "--set", "solver.load_steps=60"]
+        for values in ("0.3,0.4", "0.3,0.4", "0.45,0.4,0.3"):
+            mpitled(*words, "--vary", f"{nu}={values}")
+        kept = (out / command / table).read_bytes()
+        for others, why in (
+            ([*words, "--vary", f"{nu}=0.3,0.45"], f"with {nu}=0.4;"),
+            ([*words, "--vary", "hexahedra.hourglass=0.01"], f"over {nu};"),
+            ([*words, "--set", "solver.tolerance=0.1", "--vary", f"{nu}=0.3"], "with --set solver.load_steps=60;"),
+        ):
+            line = complaint(mpitled(*others, status=2))
+            assert f"holds the table of another {command}, {why}" in line
+            assert f"remove {out / command / command}.json to replace it" in line
+        deck.write_text(text.replace("3000", "4000"))
+        line = complaint(mpitled(*words, "--vary", f"{nu}=0.3,0.4,0.45", status=2))
+        assert "of the deck before it or a file that it reads was changed" in line
+        if command == "sweep":
+            assert "was changed since" in complaint(mpitled("report", out / "sweep", status=2))
+        deck.write_text(text)
+        assert (out / command / table).read_bytes() == kept
+        (out / command / f"{command}.json").unlink()
+        mpitled(*words, "--vary", f"{nu}=0.3")
+        assert (out / command / table).read_bytes().count(b"\n") < kept.count(b"\n")
 
 
 GROWTH = f"""{TUMOUR}

@@ -9,9 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mpitled import atomic
 from mpitled import deck as decks
-from mpitled.batch import launch, vary
+from mpitled.batch import launch, manifest, vary
 from mpitled.deck import Deck
 from mpitled.errors import InputError
 from mpitled.loading import sphere_radius
@@ -85,12 +84,10 @@ class Sweep:
         return list(dict.fromkeys(key for case in self.cases for key in case.values))
 
     def write_manifest(self) -> None:
-        """What `read` takes: a sweep goes on by its folder alone, from anywhere."""
-        self.folder.mkdir(parents=True, exist_ok=True)
+        """What `read` takes: a sweep goes on by its folder alone, from anywhere. InputError as `manifest.claim`."""
         cases = [{"number": c.number, "folder": c.folder.name, "values": c.values} for c in self.cases]
-        manifest = {"deck": str(self.deck.resolve()), "overrides": self.base, "ranks": self.ranks, "cases": cases}
-        manifest |= {"one_growth": self.one_growth}
-        atomic.write_text(self.folder / MANIFEST, json.dumps(manifest, indent=2) + "\n")
+        told = {"deck": str(self.deck.resolve()), "overrides": self.base, "ranks": self.ranks, "cases": cases}
+        manifest.claim(self.folder / MANIFEST, told | {"one_growth": self.one_growth})
 
 
 def plan(
@@ -158,14 +155,19 @@ def read(folder: Path) -> Sweep:
     """The sweep that was begun in a folder."""
     path = folder / MANIFEST
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        values = [{str(key): str(value) for key, value in case["values"].items()} for case in manifest["cases"]]
-        deck, base, ranks = Path(manifest["deck"]), [str(text) for text in manifest["overrides"]], manifest["ranks"]
-        one_growth = manifest["one_growth"]
+        told = json.loads(path.read_text(encoding="utf-8"))
+        values = [{str(key): str(value) for key, value in case["values"].items()} for case in told["cases"]]
+        deck, base, ranks = Path(told["deck"]), [str(text) for text in told["overrides"]], told["ranks"]
+        one_growth, names = told["one_growth"], [case["folder"] for case in told["cases"]]
         if type(ranks) is not int or ranks < 1 or type(one_growth) is not bool:
             raise ValueError(f"{ranks} ranks")
     except FileNotFoundError:
         raise InputError(f"{folder}: holds no sweep; give a deck, or the folder that 'mpitled sweep' wrote") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise InputError(f"{path}: cannot be read; give the deck again with --vary or --cases") from None
-    return plan(deck, values, base, ranks, folder, one_growth)
+    sweep = plan(deck, values, base, ranks, folder, one_growth)
+    if [case.folder.name for case in sweep.cases] != names:
+        raise InputError(
+            f"{folder}: {deck} or a file that it reads was changed since; undo that, or give it with another --out"
+        )
+    return sweep

@@ -10,11 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from mpitled import atomic
-from mpitled.batch import launch
+from mpitled.batch import launch, manifest
 from mpitled.batch import vary as families
-from mpitled.deck import load_deck
+from mpitled.deck import Deck, load_deck, scene_key
 from mpitled.errors import InputError
 from mpitled.results import compare
+from mpitled.solver.job import included
+
+MANIFEST = "study.json"
 
 COLUMNS = (
     "family", "value", "ranks", "max_error_mm", "rms_error_mm", "cloud_misfit_mm", "static_distance_mm", "loop_s",
@@ -31,10 +34,10 @@ class Variant:
     overrides: tuple[str, ...]
     ranks: int
 
-    @property
-    def folder(self) -> str:
-        """A name that no other variant has, and that a person can read."""
-        return families.folder(f"{self.family}-{self.value}", json.dumps([self.overrides, self.ranks]))
+    def folder(self, scene: Deck) -> str:
+        """A name that a person can read, and that no other variant has, nor this one of a deck that was changed."""
+        key = scene_key(scene, included(scene))
+        return families.folder(f"{self.family}-{self.value}", json.dumps([self.ranks, key]))
 
 
 def variants(vary: Sequence[str], base: Sequence[str]) -> Iterator[Variant]:
@@ -56,20 +59,22 @@ def study(
 
     Errors (mm) are against the reference beyond so far (m) from edges, or, without one, against the run of most cell
     updates: how near a run is to rest says nothing of its mesh. InputError for keys and values that the deck does not
-    take, before anything runs.
+    take, and for a folder that holds another study, before anything runs.
     """
     todo = list(variants(vary, base))
-    for variant in todo:
-        load_deck(deck, base, variant.overrides[len(base) :])
-    out.mkdir(parents=True, exist_ok=True)
+    folders = [out / variant.folder(load_deck(deck, base, variant.overrides[len(base) :])) for variant in todo]
+    cases = [
+        {"folder": folder.name, "values": {variant.family: variant.value}}
+        for variant, folder in zip(todo, folders, strict=True)
+    ]
+    manifest.claim(out / MANIFEST, {"deck": str(deck.resolve()), "overrides": list(base), "cases": cases})
     rows = []
-    for i, variant in enumerate(todo, 1):
-        folder = out / variant.folder
+    for i, (variant, folder) in enumerate(zip(todo, folders, strict=True), 1):
         if (failure := launch.outcome(folder)) is None:
             print(f"{i}/{len(todo)}: {variant.family} {variant.value}", file=sys.stderr, flush=True)
             failure = launch.run_apart(deck, variant.overrides, variant.ranks, folder)
         rows.append(_row(variant, failure, folder))
-    done = [(row, out / variant.folder) for row, variant in zip(rows, todo, strict=True) if not row["failure"]]
+    done = [(row, folder) for row, folder in zip(rows, folders, strict=True) if not row["failure"]]
     if reference is None and done:
         finest, reference = max(done, key=lambda run: run[0]["cell_updates"])
         finest["is_reference"] = True

@@ -73,7 +73,7 @@ def _alone(sweep: Sweep, world: World, only: int | None) -> Iterator[None]:
     def lock() -> None:
         if only is not None and is_sweep(sweep.folder):
             return  # other tasks read the manifest
-        sweep.write_manifest()
+        sweep.folder.mkdir(parents=True, exist_ok=True)
         held.append((sweep.folder / ".lock").open("w"))
         try:
             fcntl.flock(held[0], fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -81,11 +81,12 @@ def _alone(sweep: Sweep, world: World, only: int | None) -> Iterator[None]:
             raise InputError(f"{sweep.folder}: another sweep is at work there; wait for its end") from None
         except OSError:
             pass
+        sweep.write_manifest()
         for stale in sweep.folder.glob(".claims-*"):
             shutil.rmtree(stale, ignore_errors=True)
 
-    world.on_leader(lock)
     try:
+        world.on_leader(lock)
         yield
     finally:
         for file in held:
@@ -254,7 +255,11 @@ def array_job(sweep: Sweep, scheduler: str) -> Path:
     else:
         head = [f"#PBS -l select=1:ncpus={ranks}:mpiprocs={ranks}", "#PBS -l walltime=01:00:00", f"#PBS -o {folder}"]
         head += [f"#PBS -J 1-{n}"] if n > 1 else []  # PBS refuses arrays of one
-        body = [f'mpirun -n {ranks} {words} "${{PBS_ARRAY_INDEX:-1}}"']
+        body = [
+            "# Two minutes less than the walltime, in seconds: PBS gives no notice.",
+            'timeout --signal=USR1 --preserve-status "${RUN_SECONDS:-3480}" \\',
+            f'    mpirun -n {ranks} {words} "${{PBS_ARRAY_INDEX:-1}}"',
+        ]
     script = [
         "#!/usr/bin/env bash",
         *head,

@@ -42,6 +42,7 @@ class Image:
     labels: NDArray[np.int32]  # (nz, ny, nx)
     origin: NDArray[np.float64]  # (3,), m: the first voxel's lowest corner
     voxel: NDArray[np.float64]  # (3,), m: its edges along x, y, z
+    to_world: NDArray[np.float64]  # (3, 4), m: of the file's own voxel indices and a last 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +79,7 @@ class Head:
     deep: Cells  # cubes of the solid without a node on its outer surface
     parts: dict[str, Cells]  # tissue and the ventricles
     figures: dict[str, float]  # volumes, in the image and as cubes
+    to_world: NDArray[np.float64]  # (3, 4), m: of the image's voxel indices and a last 1
     remarks: tuple[str, ...]
 
 
@@ -155,7 +157,7 @@ def label_cells(labels: deck.Labels) -> Head:
     counts = {name: float(cells.sum()) for name, cells in {"solid": solid, **parts}.items()}
     counts |= {f"image_{name}": float(share.sum()) for name, share in shares.items()}
     figures = {f"{name}_volume_m3": n * size**3 for name, n in counts.items()}
-    return Head(grid, solid, deep, parts, figures, tuple(remarks))
+    return Head(grid, solid, deep, parts, figures, image.to_world, tuple(remarks))
 
 
 def read_image(path: Path) -> Image:
@@ -179,6 +181,7 @@ def read_image(path: Path) -> Image:
         if len(image.shape) != 3 or 0 in image.shape:
             raise InputError(f"{path}: has shape {image.shape}, not three dimensions; give one volume of labels")
         _check_claim(path, image)
+        to_world = image.affine[:3]
         image = nibabel.as_closest_canonical(image)
         data = np.asarray(image.dataobj)
     except InputError:
@@ -208,6 +211,7 @@ def read_image(path: Path) -> Image:
         labels=np.ascontiguousarray(data.T).astype(np.int32),
         origin=(corner - edges / 2) * metre,
         voxel=edges * metre,
+        to_world=to_world * metre,
     )
 
 
@@ -420,8 +424,13 @@ def _void(head: Head, radius: float, centre: NDArray[np.float64]) -> Cells:
         apart = _distance(grid, parts["tissue"], centre)
         low, high = (1e3 * (grid.origin + grid.size * np.array(end)) for end in ((0, 0, 0), grid.shape))
         extent = ", ".join(f"{name} {a:.0f} to {b:.0f}" for name, a, b in zip("xyz", low, high, strict=True))
+        as_voxels = head.to_world @ np.append(1e3 * centre, 1.0)
+        meant = grid.cell_of(as_voxels) if part is None else None
+        hint = ""
+        if meant is not None and head.solid[meant]:
+            hint = f"; it looks like voxels: in mm it is {in_millimetres(as_voxels).removesuffix(' mm')}"
         raise InputError(
-            f"{where}: lies {lies}, {apart} from the nearest tissue; move it into tissue (the head: {extent} mm)"
+            f"{where}: lies {lies}, {apart} from the nearest tissue; move it into tissue (the head: {extent} mm){hint}"
         )
     away = [(grid.origin[i] + grid.size * (np.arange(grid.shape[i]) + 0.5) - centre[i]) ** 2 for i in (2, 1, 0)]
     square_distance = away[0][:, None, None] + away[1][:, None] + away[2]

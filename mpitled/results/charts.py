@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 
 #: Colours and marks of families of runs, told apart by the colour-blind (Okabe and Ito 2008).
@@ -42,27 +43,91 @@ def _logarithmic(axes: Axes, x: str, y: str) -> None:
     axes.grid(True, which="both", linewidth=0.3)
 
 
-def draw_study(rows: list[dict[str, Any]], path: Path, error: str) -> None:
+@dataclass(frozen=True, slots=True)
+class _Name:
+    """Words beside a point of a chart."""
+
+    x: float
+    y: float
+    text: str
+    colour: str
+
+
+#: Where a name may stand, from the point: how far (points), and in which direction first.
+_FAR = (7.0, 14.0, 26.0, 40.0, 56.0, 74.0)
+_ROUND = np.deg2rad([35, 145, -35, -145, 0, 180, 90, -90, 62, 118, -62, -118])
+
+
+def _name_points(figure: Figure, axes: Axes, names: Sequence[_Name], size: int = 7) -> None:
+    """Write each name as near to its point as no other name and no point is covered, with a line to it if it is far.
+
+    For a figure that is done but for them: its layout must not change any more.
+    """
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    frame = axes.get_window_extent()
+    points = axes.transData.transform([(name.x, name.y) for name in names])
+    pixels = figure.dpi / 72  # in a point
+    taken = [Bbox.from_extents(*(point - 4 * pixels), *(point + 4 * pixels)) for point in points]
+    for name, point in zip(names, points, strict=True):
+        if not name.text:
+            continue
+        text = axes.text(0, 0, name.text, fontsize=size, color=name.colour, transform=None)
+        box = text.get_window_extent()
+        half = np.array([box.width, box.height]) / 2 + 0.5 * pixels
+        best, least = (0.0, point, text.get_window_extent()), np.inf
+        for far in _FAR:
+            for angle in _ROUND:
+                towards = np.array([np.cos(angle), np.sin(angle)])
+                middle = point + far * pixels * towards + half * np.clip(1.5 * towards, -1, 1)
+                place = Bbox.from_extents(*(middle - half), *(middle + half))
+                overlap = sum(_overlap(place, other) for other in taken)
+                overlap += place.width * place.height - _overlap(place, frame)
+                if overlap < least:
+                    best, least = (far, middle, place), overlap
+            if least == 0:
+                break
+        far, middle, place = best
+        text.remove()
+        taken.append(place)
+        side = (middle - point) / np.maximum(np.abs(middle - point), half)  # of the words that the line begins at
+        line = {"arrowstyle": "-", "color": name.colour, "linewidth": 0.5, "shrinkA": 0, "shrinkB": 2}
+        line |= {"relpos": tuple(0.5 - 0.5 * side)}
+        axes.annotate(
+            name.text, (name.x, name.y), xytext=tuple((middle - point) / pixels), textcoords="offset points",
+            fontsize=size, color=name.colour, ha="center", va="center", arrowprops=line if far > _FAR[0] else None,
+        )  # fmt: skip
+
+
+def _overlap(a: Bbox, b: Bbox) -> float:
+    """Area that two boxes have in common."""
+    across, down = min(a.x1, b.x1) - max(a.x0, b.x0), min(a.y1, b.y1) - max(a.y0, b.y0)
+    return max(across, 0.0) * max(down, 0.0)
+
+
+def draw_study(rows: list[dict[str, Any]], path: Path, error: str) -> Figure:
     """Error against loop time of the runs of a study, a line for each family, the best ringed (Pareto)."""
-    figure = Figure(figsize=(9, 6), layout="constrained")
+    figure = Figure(figsize=(11, 6.5), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     done = [row for row in rows if row["max_error_mm"] != ""]
     families = list(dict.fromkeys(row["family"] for row in done))
+    names = []
     for i, family in enumerate(families):
         points = [(row["loop_s"], row["max_error_mm"], row["value"]) for row in done if row["family"] == family]
         style: dict[str, Any] = {"color": _COLOURS[i % len(_COLOURS)], "marker": _MARKERS[i % len(_MARKERS)]}
         axes.plot([x for x, _, _ in points], [y for _, y, _ in points], label=family, linewidth=0.8, **style)
-        for x, y, value in points:
-            axes.annotate(value, (x, y), xytext=(5, 4), textcoords="offset points", fontsize=7, color=style["color"])
+        names += [_Name(x, y, value, style["color"]) for x, y, value in points]
     best = sorted((row["loop_s"], row["max_error_mm"]) for row in done if row["pareto"])
     axes.plot(
         [x for x, _ in best], [y for _, y in best], color=_INK, linestyle="--", linewidth=1, marker="o", markersize=12,
         markerfacecolor="none", label="none is better in both (Pareto)",
     )  # fmt: skip
     _logarithmic(axes, "time of the loop, s", error)
-    axes.legend(fontsize=8)
+    figure.legend(fontsize=8, loc="outside right upper", title="varied key; numbers: its values", title_fontsize=8)
+    _name_points(figure, axes, names)
     figure.savefig(path, dpi=150)
+    return figure
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,10 +241,10 @@ def draw_cost(points: Sequence[tuple[float, float, str]], path: Path) -> None:
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    for seconds, distance, name in points:
+    for seconds, distance, _ in points:
         axes.plot(seconds, distance, color=_COLOURS[1], marker="o", linestyle="none")
-        axes.annotate(name, (seconds, distance), xytext=(6, 4), textcoords="offset points", fontsize=8)
     _logarithmic(axes, "time of the loop, s", "from the static solution, by its own estimate, mm")
+    _name_points(figure, axes, [_Name(seconds, distance, name, _INK) for seconds, distance, name in points], size=8)
     figure.savefig(path, dpi=150)
 
 
@@ -289,17 +354,25 @@ _OUTCOMES = {
 _CELL = (0.82, 0.2)  # inches
 _MARGIN, _HEAD, _WIDTH = 1.5, 0.62, 6.6  # inches left of a panel's cells, above them, and of a panel with both
 _PANELS = 3  # beside one another
+#: What the words of a cell mean.
+_SAID = (
+    "number: largest difference from the reference (a closed form or another run), mm; percentage: share of the load",
+    "completed: it is at most 3 times what run and reference say of themselves, above all how far from rest they are;",
+    "a ramp that is millimetres off completes if it says that it is",
+    "warned: it is more, and was warned of; buckled: more, with less energy than the closed form; wrong: none of these",
+)
 
 
-def draw_matrix(rows: list[dict[str, Any]], path: Path) -> None:
+def draw_matrix(rows: list[dict[str, Any]], path: Path) -> Figure:
     """The stability matrix: a panel for each axis, kinds and methods down, values across, what became of it in words.
 
     Completed runs have their error in mm, stopped ones the share of the load that they had, or that they were refused.
+    Rows may be those of the table, all of whose values are text.
     """
     panels: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
         panels.setdefault(row["axis"], []).append(row)
-    filled = [0.4] * _PANELS  # inches from the top, for the legend first
+    filled = [0.4 + 0.16 * len(_SAID)] * _PANELS  # inches from the top, for the legend first
     places = {}
     for name, cells in panels.items():
         column = filled.index(min(filled))
@@ -313,8 +386,8 @@ def draw_matrix(rows: list[dict[str, Any]], path: Path) -> None:
     axes.axis("off")
     for i, (outcome, (colour, ink)) in enumerate(_OUTCOMES.items()):
         _cell(axes, 0.1 + i * 1.2 * _CELL[0], 0.1, outcome, colour, ink)
-    said = "completed, warned, buckled, wrong: error, mm; stopped: share of the load reached"
-    axes.text(0.1 + 6.1 * _CELL[0], 0.2, said, fontsize=7, va="center", color=_INK)
+    for i, words in enumerate(_SAID):
+        axes.text(0.1, 0.42 + 0.16 * i, words, fontsize=7, va="center", color=_INK)
     for name, (column, top, runs) in places.items():
         left, top = column * _WIDTH + _MARGIN, top + _HEAD
         values = list(dict.fromkeys(cell["value"] for cell in panels[name]))
@@ -330,6 +403,7 @@ def draw_matrix(rows: list[dict[str, Any]], path: Path) -> None:
             colours = _OUTCOMES[cell["outcome"]]
             _cell(axes, left + i * _CELL[0], top + j * _CELL[1], _words(cell), *colours)
     figure.savefig(path, dpi=150)
+    return figure
 
 
 def _cell(axes: Any, x: float, y: float, text: str, colour: str, ink: str) -> None:
@@ -343,4 +417,8 @@ def _words(cell: dict[str, Any]) -> str:
     if cell["error_mm"] != "":
         return f"{float(cell['error_mm']):.2g}"
     reached = re.search(r"unstable at ([\d.]+%)", cell["message"])
-    return reached[1] if reached else {3: "stalled", 2: "refused", 0: "error unsaid"}.get(cell["status"], "no end")
+    return (
+        reached[1]
+        if reached
+        else {"3": "stalled", "2": "refused", "0": "error unsaid"}.get(str(cell["status"]), "no end")
+    )

@@ -146,7 +146,7 @@ def _in_three_planes(
             title=f"{name + ', ' if solid.walls else ''}{'xyz'[normal]} = {at[normal]:g} mm",
         )
         if right == 0:
-            _sides(axes, solid)
+            sides(axes, solid)
     return figure
 
 
@@ -240,8 +240,8 @@ def _outlines(
         axes.fill(*outline.T, color="0.82", zorder=2)
 
 
-def _sides(axes: Any, solid: Solid) -> None:
-    """L and R where x runs to the right, from where the ventricles lie."""
+def sides(axes: Any, solid: Solid) -> None:
+    """L and R where x runs to the right, of the body's own sides, from where the ventricles lie."""
     if len(solid.walls) < 2:
         return
     left, right = (solid.points[solid.walls[f"{side}_ventricle"], 0].mean() for side in ("left", "right"))

@@ -48,16 +48,17 @@ def solid_of(model: Model, displacement: NDArray[np.float64]) -> Solid:
             walls[name] = triangles_of(boundary_faces(cells[ventricle]))
     seed, interface = (model.node_sets.get(name, none) for name in ("tumour", "interface"))
     cloud = _cloud(model, points, seed, interface)
+    between = triangles_of(interface_faces(model.points, cells, interface, model.domain_points))
     return Solid(
         points=_with_centres(points, cells),
         displacement=_with_centres(1e3 * displacement, cells),
         hexahedra=cells,
         centres=np.arange(n, n + len(cells)),
         cloud=cloud,
-        interface=triangles_of(interface_faces(model.points, cells, interface, model.domain_points)),
+        interface=between,
         walls=walls,
         tumour=seed[ConvexHull(points[seed]).simplices] if len(seed) else np.empty((0, 3), np.int64),
-        surface=_surface(model, cloud, seed, interface),
+        surface=_surface(model, cloud, seed, interface, between),
     )
 
 
@@ -84,17 +85,24 @@ def _cloud(
 
 
 def _surface(
-    model: Model, cloud: NDArray[np.int64], seed: NDArray[np.int64], interface: NDArray[np.int64]
+    model: Model,
+    cloud: NDArray[np.int64],
+    seed: NDArray[np.int64],
+    interface: NDArray[np.int64],
+    between: NDArray[np.int64],
 ) -> NDArray[np.int64]:
     """Triangles (n, 3) of hexahedra and of the cloud that are of one cell alone, without interface and tumour.
 
-    Anticlockwise seen from outside. Tetrahedra next to the interface may end short of it: their triangles there are
-    left out too.
+    Anticlockwise seen from outside. Tetrahedra next to the interface may end short of it or reach into hexahedra, of
+    which support domains take nodes: their triangles there are left out too, and all of the cloud if the triangles
+    `between` it and hexahedra are closed, for then it lies inside.
     """
     inside = np.zeros(model.n_nodes, bool)
     inside[interface] = inside[seed] = True
     faces = boundary_faces(model.hexahedra)
     of_hexahedra = triangles_of(faces[~inside[faces].all(axis=1)])
+    if _is_closed(between):
+        return of_hexahedra
     # Each tetrahedron without one of its corners in turn, which lies behind the others.
     behind = np.concatenate([np.roll(cloud, -k, axis=1) for k in range(4)])
     _, first, count = np.unique(np.sort(behind[:, 1:], axis=1), axis=0, return_index=True, return_counts=True)
@@ -103,7 +111,15 @@ def _surface(
     inwards = (np.cross(b - a, c - a) * (last - a)).sum(axis=1) > 0
     behind[inwards, 1:3] = behind[inwards, 2:0:-1]
     of_cloud = behind[:, 1:]
+    inside[: model.n_fe_nodes] = True
     return np.concatenate([of_hexahedra, of_cloud[~inside[of_cloud].any(axis=1)]])
+
+
+def _is_closed(triangles: NDArray[np.int64]) -> bool:
+    """Whether triangles (n, 3) are the whole boundary of something: as many of them on both sides of every edge."""
+    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    _, count = np.unique(edges, axis=0, return_counts=True)
+    return len(triangles) > 0 and bool((count % 2 == 0).all())
 
 
 def triangles_of(faces: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -27,6 +27,7 @@ from mpitled.results.solid import Solid, displaced, solid_of
 #: Of parts, told apart by the colour-blind (Okabe and Ito 2008), and the map of displacements, as in the cuts.
 COLOURS = {"tumour": "#d55e00", "left ventricle": "#0072b2", "right ventricle": "#56b4e9", "body": "#d9d4cc"}
 MAP = "magma_r"
+_THIN = 0.4  # opacity of the body around the parts
 _SCALARS = "displacement (mm)"
 _LONGEST = 120  # s that PyVista may take for the pictures
 _PIXELS = 900  # width of a panel
@@ -186,6 +187,8 @@ def _draw(directory: Path, path: Path, painter: Callable[[Solid], _Paint]) -> No
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
+    from mpitled.results.plot import sides
+
     outcome = report.read(directory)
     solid = solid_of(outcome.model, outcome.moved)
     paint, chosen = painter(solid), views(solid, outcome.centre)
@@ -201,6 +204,7 @@ def _draw(directory: Path, path: Path, painter: Callable[[Solid], _Paint]) -> No
                 title=f"{when}, {view.title}", xlabel=view.labels[0], ylabel=view.labels[1], aspect="equal",
                 xlim=(view.low[0], view.high[0]), ylim=(view.low[1], view.high[1]),
             )  # fmt: skip
+            sides(axes, solid)
     figure.colorbar(
         ScalarMappable(_norm(solid), MAP), ax=panels[:, 1], label="after: displacement (mm)", shrink=0.6, pad=0.02
     )
@@ -208,6 +212,10 @@ def _draw(directory: Path, path: Path, painter: Callable[[Solid], _Paint]) -> No
     if len(solid.tumour):  # its surface moves so far that it hardly looks coloured
         moved = float(np.linalg.norm(solid.displacement[solid.tumour], axis=-1).mean())
         shown.append(Patch(facecolor=colormaps[MAP](_norm(solid)(moved)), label="after: tumour"))
+    if "body" not in parts(solid):
+        shown.append(
+            Patch(facecolor=COLOURS["body"], alpha=_THIN, label="before and after: surface of the body behind them")
+        )
     figure.legend(handles=shown, loc="outside lower center", ncols=len(shown), frameon=False)
     figure.savefig(path, dpi=110)
 
@@ -251,7 +259,7 @@ def _add(plotter: Any, solid: Solid, share: float, largest: float) -> None:
     if "body" not in shown:
         # Its far side alone, which does not lie before the parts and change their colours.
         body = _surface(solid, solid.surface, share)
-        plotter.add_mesh(body, color=COLOURS["body"], opacity=0.4, culling="front", name="around", **light)
+        plotter.add_mesh(body, color=COLOURS["body"], opacity=_THIN, culling="front", name="around", **light)
     for name, triangles in shown.items():
         paint = {"scalars": _SCALARS, "cmap": MAP, "clim": (0, largest)} if share else {"color": COLOURS[name]}
         plotter.add_mesh(_surface(solid, triangles, share), name=name, **paint, **light)

@@ -1,8 +1,9 @@
-"""What a run of a deck would do, without a step of it: terms, kernels, arrays, what is left out and why, how long."""
+"""What a run of a deck would do, without a step of it: how long, terms, kernels, arrays, what is left out and why."""
 
 from __future__ import annotations
 
 import textwrap
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import partial
@@ -23,10 +24,11 @@ from mpitled.speed import forecast
 from mpitled.speed.witness import Call, distinct_bytes, witness
 
 
-def dry_run(deck: Deck, directory: Path, world: World) -> str:
+def dry_run(deck: Deck, directory: Path, world: World, *, verbose: bool = False) -> str:
     """Model, partition and composition as the run itself makes them, in words that are the same on all ranks.
 
-    Every kernel is called a few times on the undeformed body, to see which it is, what it takes and how long.
+    Every kernel is called a few times on the undeformed body, to see which it is, what it takes and how long. What
+    matters most comes first; with `verbose` every array has its shape.
     """
     run = job.prepare(deck, directory, world)
     run.warm_up()
@@ -40,14 +42,15 @@ def dry_run(deck: Deck, directory: Path, world: World) -> str:
     counts = [sub.rows.n_own_hexahedra, sub.rows.n_own_domains, sub.n_nodes, sum(len(nodes) for _, nodes in sub.shared)]
     sizes = [distinct_bytes(calls) / sub.n_cells, _held_bytes(method) / sub.n_cells]
     table = world.gather([*counts, *sizes, 1e3 * step, 1e3 * survey])
-    lines = [
+    lines = _forecast(run, table[:, -2].max() / 1e3, table[:, -1].max() / 1e3)
+    lines += [
         f"{'rank':>4}{'hexahedra':>11}{'domains':>9}{'nodes':>9}{'shared':>8}{'step, bytes a cell':>20}"
         f"{'held, bytes a cell':>20}{'step, ms':>10}{'survey, ms':>12}"
     ]
     for rank, row in enumerate(table):
         numbers = [f"{value:{width}.0f}" for value, width in zip(row, (11, 9, 9, 8, 20, 20), strict=False)]
         lines.append(f"{rank:4}{''.join(numbers)}{row[-2]:10.3f}{row[-1]:12.3f}")
-    lines += _told(calls, surveyed, seconds)
+    lines += _told(calls, surveyed, seconds, verbose)
     own = _left_out(deck, sub, world.size, (*calls, *surveyed))
     left_out = [world.broadcast(own, rank) for rank in range(world.size)]
     lines.append("left out:")
@@ -55,27 +58,61 @@ def dry_run(deck: Deck, directory: Path, world: World) -> str:
         ranks = [str(rank) for rank, of_rank in enumerate(left_out) if what in of_rank]
         where = "" if len(ranks) == world.size else f" (on rank {', '.join(ranks)})"
         lines.append(f"  {what}{where}")
-    return str(
-        world.broadcast("\n".join([*lines, *_forecast(run, table[:, -2].max() / 1e3, table[:, -1].max() / 1e3)]))
-    )
+    if not verbose:
+        lines.append("-v tells the shape and type of every array")
+    return str(world.broadcast("\n".join(lines)))
 
 
-def _told(calls: Sequence[Call], surveyed: Sequence[Call], seconds: dict[str, float]) -> list[str]:
+def _told(calls: Sequence[Call], surveyed: Sequence[Call], seconds: dict[str, float], verbose: bool) -> list[str]:
     """Each term with its time, its kernels and their arrays, those of rank 0."""
+    kernels = _in_full if verbose else _in_short
     lines = ["each step, on rank 0:"]
     for name, of_term in seconds.items():
         lines.append(f"  {name}, {1e3 * of_term:.3f} ms")
-        lines += _kernels([call for call in calls if call.term == name])
-    return [*lines, "each survey, on rank 0:", *_kernels(surveyed)]
+        lines += kernels([call for call in calls if call.term == name])
+    lines.append("each survey, on rank 0:")
+    if not verbose:
+        known = {call.kernel for call in calls}
+        again = Counter(call.kernel for call in surveyed if call.kernel in known)
+        surveyed = [call for call in surveyed if call.kernel not in known]
+        lines += [f"    as in a step: {', '.join(f'{name}{_times(n)}' for name, n in again.items())}"] if again else []
+    return [*lines, *kernels(surveyed)]
 
 
-def _kernels(calls: Sequence[Call]) -> list[str]:
-    lines = []
+def _times(n: int) -> str:
+    return "" if n == 1 else f" {n} times"
+
+
+def _in_short(calls: Sequence[Call]) -> list[str]:
+    """A line for each kernel, however often it is called, with the names of its arrays."""
+    kernels: dict[str, list[Call]] = {}
     for call in calls:
-        arrays = [f"{name} {'x'.join(map(str, a.shape))} {a.dtype}" for name, a in call.arrays.items()]
-        size = sum(a.nbytes for a in call.arrays.values()) / 1e6
-        text = f"{call.kernel}, {size:.3g} MB: {', '.join(arrays)}"
-        lines += textwrap.wrap(text, 118, initial_indent="    ", subsequent_indent="      ", break_on_hyphens=False)
+        kernels.setdefault(call.kernel, []).append(call)
+    lines = []
+    for name, of_kernel in kernels.items():
+        arrays = dict.fromkeys(array for call in of_kernel for array in call.arrays)
+        size = distinct_bytes(of_kernel) / 1e6
+        lines.append(f"    {name}{_times(len(of_kernel))}, {size:.3g} MB: {' '.join(arrays)}")
+    return lines
+
+
+def _in_full(calls: Sequence[Call]) -> list[str]:
+    """The calls that differ, with each array's shape and type."""
+    told = Counter(
+        f"{call.kernel}, {sum(a.nbytes for a in call.arrays.values()) / 1e6:.3g} MB: "
+        + ", ".join(f"{name} {'x'.join(map(str, a.shape))} {a.dtype}" for name, a in call.arrays.items())
+        for call in calls
+    )
+    lines = []
+    for text, n in told.items():
+        kernel, rest = text.split(",", 1)
+        lines += textwrap.wrap(
+            f"{kernel}{_times(n)},{rest}",
+            118,
+            initial_indent="    ",
+            subsequent_indent="      ",
+            break_on_hyphens=False,
+        )
     return lines
 
 

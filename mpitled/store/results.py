@@ -17,6 +17,8 @@ from mpitled.store.files import AGAIN, attribute, checksum_of, first_broken, mat
 #: Results of another layout are refused.
 RESULT_LAYOUT = 1
 FINISHED, UNFINISHED = "result.vtkhdf", "result.partial.vtkhdf"
+#: Of what is in a result, as the attribute "units" of its dataset says too; decks and reports are in mm.
+UNITS = {"Points": "m", "displacement": "m", "field_displacement": "m", "Values": "s"}
 HEXAHEDRON, EFG_NODE, INTEGRATION_POINT = 0, 1, 2
 
 

@@ -36,6 +36,7 @@ from mpitled.store.results import (
     INTEGRATION_POINT,
     RESULT_LAYOUT,
     UNFINISHED,
+    UNITS,
     Result,
     open_result,
     series_of,
@@ -316,7 +317,7 @@ class ResultWriter:
             return [np.full(n, value, dtype) for value, n in zip(values, counts[1:], strict=True)]
 
         # What is longest goes by blocks, as many on all ranks.
-        made = make(grid, "Points", (self._n_points, 3), np.float64)
+        made = _with_units(make(grid, "Points", (self._n_points, 3), np.float64))
         (row, _), of_domains = self._point_slabs
         share = self._write(made, [of_domains], [part.read("domain_points")])
         for first, last in _blocks(len(part.nodes), self._most_nodes):
@@ -349,7 +350,7 @@ class ResultWriter:
         steps = grid.create_group("Steps")
         steps.attrs["NSteps"] = np.int64(0)
         # One row at first, so that its one chunk has its place in the file; later only the extent changes.
-        values = make(steps, "Values", (1,), np.float64, maxshape=(n,), chunks=(n,))
+        values = _with_units(make(steps, "Values", (1,), np.float64, maxshape=(n,), chunks=(n,)))
         if self._leads:
             values[...] = 0.0
         self._table(steps, "NumberOfParts", np.ones(n))
@@ -366,7 +367,7 @@ class ResultWriter:
             for name in data:
                 self._table(offsets, name, np.zeros(n))
             for name, width in components.items():
-                make(data, name, (n * n_rows, width)[: 1 + (width > 1)], np.float64)
+                _with_units(make(data, name, (n * n_rows, width)[: 1 + (width > 1)], np.float64))
                 self._table(offsets, name, n_rows * np.arange(n))
         for name in series:
             numbers = make(grid, f"FieldData/{name}", (n,), np.float64)
@@ -391,6 +392,14 @@ class ResultWriter:
 
     def _write(self, dataset: h5py.Dataset, slabs: Slabs, pieces: Sequence[NDArray[Any]], first_row: int = 0) -> int:
         return write_rows(dataset, slabs, pieces, first_row, self._transfer)
+
+
+def _with_units(dataset: h5py.Dataset) -> h5py.Dataset:
+    """The same, which says what its numbers are in, if there is a unit."""
+    name = dataset.name.rpartition("/")[2]
+    if name in UNITS:
+        dataset.attrs["units"] = np.bytes_(UNITS[name])
+    return dataset
 
 
 def _blocks(length: int, most: int) -> Iterator[tuple[int, int]]:
