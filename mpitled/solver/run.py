@@ -424,9 +424,7 @@ class Run:
         field = np.where(rows.owned & (rows.nodes < rows.n_fe_nodes), u, 0.0)
         domains = rows.read("cells", rows.n_own_hexahedra) - rows.n_hexahedra
         giving = self.sub.domain_nodes[np.searchsorted(domains, rows.field_domains)]
-        field[:, np.searchsorted(rows.nodes, rows.field_nodes)] = np.einsum(
-            "ga,cga->cg", rows.field_shapes, u[:, giving]
-        )
+        field[:, rows.local(rows.field_nodes)] = np.einsum("ga,cga->cg", rows.field_shapes, u[:, giving])
         if self.force_halo is not None:
             self.force_halo.sum(field)
         return field

@@ -107,7 +107,7 @@ class PartRows:
     n_domains: int  # of the whole model
     n_own_hexahedra: int
     n_own_domains: int
-    nodes: NDArray[np.int64]  # (k,) ascending nodes that the part's cells touch
+    nodes: NDArray[np.signedinteger]  # (k,) ascending nodes that the part's cells touch; int32 as far as it goes
     owned: NDArray[np.bool_]  # (k,)
     first_row: int  # row of the first owned node; owned nodes follow each other
     materials: tuple[Material, ...]
@@ -135,6 +135,11 @@ class PartRows:
             "domains": self.n_own_domains,
         }
         return lengths[_COLUMNS[name]]
+
+    def local(self, nodes: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Places of nodes in `nodes`, where they have to be."""
+        # Of its own type, or numpy would make `nodes` anew of the other.
+        return np.searchsorted(self.nodes, nodes.astype(self.nodes.dtype, copy=False))
 
     def read(self, name: str, first: int = 0, last: int | None = None) -> NDArray[Any]:
         """Rows first to last of a long column, from the file. InputError if it cannot be read any more."""
@@ -242,7 +247,7 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
             n_domains=n_domains,
             n_own_hexahedra=n_own_hexahedra,
             n_own_domains=n_own_cells - n_own_hexahedra,
-            nodes=nodes,
+            nodes=nodes.astype(np.int32) if n_nodes <= np.iinfo(np.int32).max else nodes,
             owned=(rows >= first_row) & (rows < end_row),
             first_row=int(first_row),
             materials=read_materials(file),
@@ -269,7 +274,7 @@ def _check_columns(part: PartRows) -> None:
             if name in ("hexahedra", "domains"):
                 # As `localise` will find them: a node of which this part has no copy would be beyond its arrays.
                 check_numbers(values, part.n_nodes, name)
-                if not (part.nodes.take(np.searchsorted(part.nodes, values), mode="clip") == values).all():
+                if not (part.nodes.take(part.local(values), mode="clip") == values).all():
                     raise ValueError(f"{name} have nodes that their part has not")
             elif name == "material":
                 check_numbers(values, len(part.materials), name)
