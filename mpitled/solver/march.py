@@ -81,6 +81,7 @@ class March:
             term(s)
         self.survey.look(s, self.safety)
         required = self._required()
+        self._sharpen()
         s.f[:] = 0
         if self.scales_mass:
             critical = self.typical / math.sqrt(self.sharpness.share)
@@ -179,23 +180,29 @@ class March:
         self.added_energy += energy
 
     def _required(self) -> NDArray[np.float64]:
-        """Mass (kg) that each node needs after a survey, on all ranks; renews now and then how sharp its bound is."""
-        s, required = self.state, self.survey.required[0]
+        """Mass (kg) that each node needs after a survey, on all ranks."""
+        required = self.survey.required[0]
         if self.halo is not None:
             self.halo.sum(self.survey.required)
         required[self.prescribed] = 0
-        if self.sharpness.due():
-            mobility, bound = s.mobility, (2 * self.safety) ** 2
-            if self.scales_mass:
-                mobility = np.divide(s.time_step**2, required, out=np.zeros_like(required), where=required > 0)
-            else:
-                bound *= self._largest((required / s.mass).max())
-            self.sharpness.renew(s, mobility[None], bound)
-        required *= self.sharpness.share
+        required *= self.sharpness.share or 1.0
         return required
 
+    def _sharpen(self) -> float:
+        """Renew how sharp the bound is, of which `required` is this share; by what factor the stable step shrank."""
+        s, required, share = self.state, self.survey.required[0], self.sharpness.share or 1.0
+        mobility, bound = s.mobility, (2 * self.safety) ** 2 / share
+        if self.scales_mass:
+            mobility = np.divide(s.time_step**2, required, out=np.zeros_like(required), where=required > 0)
+        else:
+            bound *= self._largest((required / s.mass).max())
+        self.sharpness.renew(s, mobility[None], bound, s.good)
+        grown = self.sharpness.share / share
+        required *= grown
+        return math.sqrt(grown)
+
     def decide(self, figures: dict[str, float]) -> tuple[bool, bool]:
-        """The length of the next steps; whether a frame is due now, and whether it is the last."""
+        """The length of the next steps; whether a frame is due now, and whether it is the last. Spoils `State.good`."""
         s = self.state
         due = s.time >= self.frame * self.frame_span - 0.5 * s.time_step
         if due:
@@ -203,6 +210,11 @@ class March:
             self.frame += 1
         if s.time >= self.end - 0.5 * s.time_step:
             return due, True
+        # Only now: it needs the room of the last good state, which this one is.
+        if self.sharpness.due():
+            figures["step_ratio"] *= self._sharpen()
+            if self.scales_mass:
+                self._raise_mass(self.survey.required[0])
         shrunk = figures["step_ratio"] / self.safety
         allowed = self.longest if self.scales_mass else min(self.longest, s.time_step / shrunk)
         longer = False

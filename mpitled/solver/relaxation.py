@@ -212,7 +212,8 @@ class Relaxation:
         if self.sharpness.due() and (s.share < 1 or self.sharpness.share == 0):
             # Where the looking goes on, the mobility that lasts is made of what is found.
             kernels.invert_masses(self.required, self.free, s.mobility)
-            self.sharpness.renew(s, s.mobility, (2 * self.safety) ** 2)
+            mode = np.empty(s.good.shape, s.good.dtype)  # for it is not known yet whether this state is good
+            self.sharpness.renew(s, s.mobility, (2 * self.safety) ** 2, mode)
         self.required *= self.sharpness.share
         return found
 

@@ -38,6 +38,7 @@ class State:
     mass: NDArray[np.float64]  # (n_nodes,), kg, as scaled; in relaxation (6, n_nodes), its symmetric tensor
     mobility: NDArray[np.float64]  # as mass, s^2/kg: dt^2 times its inverse
     reaction: NDArray[np.float64]  # (n owned moving dofs,), N
+    good: NDArray[np.float32]  # (3, n_nodes), m, the last displacements that were found good; room between steps
     load_time: float  # s
     time_step: float  # s
     time: float = 0.0  # s
@@ -84,7 +85,8 @@ def at_rest(sub: Subdomain, load_time: float, time_step: float) -> State:
     f = np.zeros_like(seen)
     mass = sub.rows.read("mass").copy()  # columns in memory stay as they are
     owned_moving = int(np.count_nonzero(sub.rows.owned[sub.moving // 3]))
-    return State(u, u_prev, seen, f, mass, time_step**2 / mass, np.zeros(owned_moving), load_time, time_step)
+    good = np.zeros((3, sub.n_nodes), np.float32)
+    return State(u, u_prev, seen, f, mass, time_step**2 / mass, np.zeros(owned_moving), good, load_time, time_step)
 
 
 def compose_forces(sub: Subdomain, halo: Halo | None) -> tuple[Term, ...]:

@@ -163,7 +163,7 @@ class PartRows:
 class _File:
     """The long columns of one part in an open model; it stays open, whatever becomes of its name."""
 
-    def __init__(self, path: Path, n_parts: int, part: int, nodes: NDArray[np.int64]) -> None:
+    def __init__(self, path: Path, n_parts: int, part: int, nodes: NDArray[np.signedinteger]) -> None:
         """nodes: of the part, ascending."""
         self._file, self._path, self._nodes = open_file(path), path, nodes
         self._group = None if n_parts == 1 else self._file[f"partitions/{n_parts}"]
@@ -200,7 +200,7 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
     with open_model(path) as file:
         n_nodes, n_hexahedra, n_domains = (len(file[name]) for name in ("points", "hexahedra", "domains"))
         if n_parts == 1:
-            nodes = rows = np.arange(n_nodes)
+            nodes = rows = _numbers(np.arange(n_nodes), n_nodes)
             source = _File(path, n_parts, part, nodes)
             n_own_hexahedra, n_own_cells = n_hexahedra, n_hexahedra + n_domains
             own_domains = np.arange(n_domains)
@@ -230,6 +230,7 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
                 check_ascending(numbers, name)
             if part in neighbours or not np.isin(shared, nodes).all():
                 raise ValueError("a part shares with itself, or nodes that are not its own")
+            nodes = _numbers(nodes, n_nodes)
             source = _File(path, n_parts, part, nodes)
             n_own_hexahedra, n_own_cells = source.n_own_hexahedra, len(cells)
             own_domains = cells[n_own_hexahedra:] - n_hexahedra
@@ -247,7 +248,7 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
             n_domains=n_domains,
             n_own_hexahedra=n_own_hexahedra,
             n_own_domains=n_own_cells - n_own_hexahedra,
-            nodes=nodes.astype(np.int32) if n_nodes <= np.iinfo(np.int32).max else nodes,
+            nodes=nodes,
             owned=(rows >= first_row) & (rows < end_row),
             first_row=int(first_row),
             materials=read_materials(file),
@@ -265,6 +266,11 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
         check_finite({f.name: v for f in fields(PartRows) if isinstance(v := getattr(part_rows, f.name), np.ndarray)})
         _check_columns(part_rows)
         return part_rows
+
+
+def _numbers(nodes: NDArray[np.int64], n_nodes: int) -> NDArray[np.signedinteger]:
+    """In half the room where a model has no more than 2^31 nodes."""
+    return nodes.astype(np.int32) if n_nodes <= np.iinfo(np.int32).max else nodes
 
 
 def _check_columns(part: PartRows) -> None:
