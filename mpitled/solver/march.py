@@ -72,7 +72,7 @@ class March:
         # at most. Fewer are taken, `between`, so that surveys fill a frame.
         self.interval, self.shortest_interval, self.longest_interval = 1, 1, 1
         self.forces, self.motion = compose_forces(sub, force_halo), compose_march(sub)
-        self.sharpness = Sharpness(sub, world, self.forces, sub.free())
+        self.sharpness = Sharpness(sub, world, self.forces)
 
     def begin(self) -> None:
         """Find the step. Collective. InputError, alike on all ranks, for a step that is too long."""
@@ -86,7 +86,7 @@ class March:
         if self.scales_mass:
             critical = self.typical / math.sqrt(self.sharpness.share)
         else:
-            critical = s.time_step / (self.safety * float(np.sqrt(self._largest((required / s.mass).max()))))
+            critical = s.time_step / (self.safety * math.sqrt(self._largest(self._needed(required))))
         if solver.time_step == "auto":
             self.longest = self.safety * critical
         else:
@@ -106,10 +106,14 @@ class March:
         # Where a wave may run, one survey does not tell of the next.
         self.longest_interval = longest if self.solver.method == "quasi-static" else shortest
         s.time_step = self._fitting(self.longest, self.frame_span)
-        np.divide(s.time_step**2, s.mass, out=s.mobility)
+        s.mobility *= s.time_step**2  # from a step of 1 s
         if self.scales_mass:
             required *= s.time_step**2
             self._raise_mass(required)
+
+    def _needed(self, required: NDArray[np.float64]) -> float:
+        """The most of its mass that a node of this rank needs."""
+        return float((required * self.state.mobility).max()) / self.state.time_step**2
 
     def _largest(self, value: float) -> float:
         return float(self.world.gather([value]).max())
@@ -150,7 +154,7 @@ class March:
         rehearse(twin.state, (*self.forces, *self.motion))
         twin.look()
         self.state.rest()
-        self.state.mass[:] = self.sub.rows.read("mass")
+        np.divide(self.state.time_step**2, self.sub.rows.read("mass"), out=self.state.mobility)
 
     def look(self) -> dict[str, float]:
         """This rank's share of the figures at the present time, for which the forces are there.
@@ -162,8 +166,8 @@ class March:
         s, owned = self.state, self.sub.rows.owned
         found = self.survey.look(s, self.safety)
         required = self._required()
-        found["kinetic"] = kernels.kinetic_energy(s.u, s.u_prev, s.f, s.mass, s.mobility, owned, self.held, s.time_step)
-        found["step_ratio"] = self.safety * float(np.sqrt((required / s.mass).max()))
+        found["kinetic"] = kernels.kinetic_energy(s.u, s.u_prev, s.f, s.mobility, owned, self.held)
+        found["step_ratio"] = self.safety * math.sqrt(self._needed(required))
         if self.scales_mass:
             self._raise_mass(required)
         return found | {
@@ -175,7 +179,7 @@ class March:
 
     def _raise_mass(self, required: NDArray[np.float64]) -> None:
         s = self.state
-        mass, energy = kernels.raise_mass(s.u, s.u_prev, s.mass, s.mobility, required, self.sub.rows.owned, s.time_step)
+        mass, energy = kernels.raise_mass(s.u, s.u_prev, s.mobility, required, self.sub.rows.owned, s.time_step)
         self.added_mass += mass
         self.added_energy += energy
 
@@ -195,7 +199,7 @@ class March:
         if self.scales_mass:
             mobility = np.divide(s.time_step**2, required, out=np.zeros_like(required), where=required > 0)
         else:
-            bound *= self._largest((required / s.mass).max())
+            bound *= self._largest(self._needed(required))
         self.sharpness.renew(s, mobility[None], bound, s.good)
         grown = self.sharpness.share / share
         required *= grown
@@ -239,6 +243,6 @@ class March:
         ratio = time_step / s.time_step
         if abs(ratio - 1) < 1e-12:
             return
-        np.divide(time_step**2, s.mass, out=s.mobility)
+        s.mobility *= ratio**2
         kernels.change_step(s.u, s.u_prev, s.f, s.mobility, ratio)
         s.time_step = time_step

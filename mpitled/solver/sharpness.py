@@ -34,9 +34,10 @@ class Sharpness:
 
     LASTING = Kept(alike=("share", "wait"))
 
-    def __init__(self, sub: Subdomain, world: World, forces: tuple[Term, ...], free: NDArray[np.bool_]) -> None:
-        """free (3, n_nodes): see `Subdomain.free`."""
-        self._sub, self._world, self._forces, self._free = sub, world, forces, free
+    def __init__(self, sub: Subdomain, world: World, forces: tuple[Term, ...]) -> None:
+        self._sub, self._world, self._forces = sub, world, forces
+        held = np.concatenate([sub.fixed, sub.moving])
+        self._held = held % 3, held // 3
         self.share = 0.0  # of the bound, that the operator has had at most
         self.wait = 0  # surveys until it is looked for again
         spread = float(np.ptp(sub.rows.read("points"), axis=0).max()) if sub.n_nodes else 0.0
@@ -75,7 +76,8 @@ class Sharpness:
         rows, trial = self._sub.rows, copy(s)
         trial.f = np.empty_like(s.f)
         # The mode has less than the displacements' precision, for whatever it is, it is tried as it is.
-        kernels.scramble(mode, rows.nodes, self._free)
+        kernels.scramble(mode, rows.nodes)
+        mode[self._held] = 0
         size, weight, found = self._largest(np.abs(mode).max(initial=0.0)), 0.0, 0.0
         for iteration in range(AGAIN if self.share else FIRST):
             if not 0 < size < math.inf:
@@ -88,7 +90,8 @@ class Sharpness:
             self._take(trial)
             kernels.perturb(s.u, mode, -scale if s.seen is s.u else 0.0, s.seen)
             # The mode becomes mobility times its response, so that the response times it is mode . M mode.
-            sums = kernels.respond(mode, trial.f, s.f, mobility, self._free, rows.owned, self._reach, size)
+            trial.f[self._held] = s.f[self._held]
+            sums = kernels.respond(mode, trial.f, s.f, mobility, rows.owned, self._reach, size)
             table = self._world.gather(sums)
             quotient, last = float(table[:, 0].sum()), found
             if iteration > 0 and weight > 0:
