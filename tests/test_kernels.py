@@ -180,7 +180,7 @@ def test_forces_energies_and_jacobians_are_those_of_the_plain_formulas(scene, st
     assert state.smallest_jacobian == pytest.approx(J.min(), rel=1e-14)
     seen = Survey(sub)
     figures = seen.look(state, 1.0)
-    assert seen.jacobian[:-1] == pytest.approx(J, rel=1e-13)
+    assert seen.jacobian[:-1] == pytest.approx(J, rel=2.0**-23)  # as it is kept
     assert figures["strain"] == pytest.approx(strain, rel=1e-10)  # W is a small difference of (J - 1) and ln J
     assert figures["hourglass"] + figures["stabilisation"] == pytest.approx(resisted, rel=1e-12)
 
@@ -346,8 +346,7 @@ def test_energy_is_kept_by_the_central_difference():
 
     def swing(time_step):
         state = at_rest(sub, 1e6, time_step)
-        state.mass[:] = 1e-5
-        state.mobility[:] = time_step**2 / state.mass
+        state.mobility[:] = time_step**2 / 1e-5
         state.u[:, : sub.n_nodes] = (points * [0.05, -0.02, -0.02]).T
         state.u_prev[:] = state.u
         survey, owned, none = Survey(sub), np.ones(sub.n_nodes, bool), np.zeros(0, np.uint32)
@@ -356,9 +355,7 @@ def test_energy_is_kept_by_the_central_difference():
             for _, term in terms[:-1]:
                 term(state)
             figures = survey.look(state, 1.0)
-            kinetic = kernels.kinetic_energy(
-                state.u, state.u_prev, state.f, state.mass, state.mobility, owned, none, time_step
-            )
+            kinetic = kernels.kinetic_energy(state.u, state.u_prev, state.f, state.mobility, owned, none)
             energies.append(figures["strain"] + figures["hourglass"] + kinetic)
             terms[-1][1](state)
         energies = np.array(energies)

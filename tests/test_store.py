@@ -157,7 +157,7 @@ def test_parts_are_the_rows_of_the_model(tmp_path: Path, n_parts: int) -> None:
         given = np.flatnonzero(np.isin(model.field_domains, domains))
         expected = {
             "cells": cells,
-            "nodes": np.unique([*rows.read("hexahedra").ravel(), *rows.read("domains").ravel()]).astype(np.int64),
+            "nodes": np.unique([*rows.read("hexahedra").ravel(), *rows.read("domains").ravel()]).astype(np.int32),
             "points": model.points[rows.nodes],
             "mass": model.mass[rows.nodes],
             "hexahedra": model.hexahedra[cells[cells < n_hexahedra]],
@@ -179,7 +179,7 @@ def test_parts_are_the_rows_of_the_model(tmp_path: Path, n_parts: int) -> None:
             assert same(getattr(rows, name) if hasattr(rows, name) else rows.read(name), value), name
         shares = np.split(rows.shared, rows.shared_offsets[1:-1]) if len(rows.neighbours) else []
         for q, nodes in zip(rows.neighbours, shares, strict=True):
-            assert same(nodes, np.intersect1d(rows.nodes, read[q].nodes))
+            assert same(nodes, np.intersect1d(rows.nodes, read[q].nodes).astype(np.int64))
         owners[rows.nodes[rows.owned]] += 1
         owned_rows = rows.read("rows")[rows.owned]
         assert same(owned_rows, rows.first_row + np.arange(len(owned_rows)))

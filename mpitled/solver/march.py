@@ -72,7 +72,7 @@ class March:
         # at most. Fewer are taken, `between`, so that surveys fill a frame.
         self.interval, self.shortest_interval, self.longest_interval = 1, 1, 1
         self.forces, self.motion = compose_forces(sub, force_halo), compose_march(sub)
-        self.sharpness = Sharpness(sub, world, self.forces, sub.free())
+        self.sharpness = Sharpness(sub, world, self.forces)
 
     def begin(self) -> None:
         """Find the step. Collective. InputError, alike on all ranks, for a step that is too long."""
@@ -81,11 +81,12 @@ class March:
             term(s)
         self.survey.look(s, self.safety)
         required = self._required()
+        self._sharpen()
         s.f[:] = 0
         if self.scales_mass:
             critical = self.typical / math.sqrt(self.sharpness.share)
         else:
-            critical = s.time_step / (self.safety * float(np.sqrt(self._largest((required / s.mass).max()))))
+            critical = s.time_step / (self.safety * math.sqrt(self._largest(self._needed(required))))
         if solver.time_step == "auto":
             self.longest = self.safety * critical
         else:
@@ -105,10 +106,14 @@ class March:
         # Where a wave may run, one survey does not tell of the next.
         self.longest_interval = longest if self.solver.method == "quasi-static" else shortest
         s.time_step = self._fitting(self.longest, self.frame_span)
-        np.divide(s.time_step**2, s.mass, out=s.mobility)
+        s.mobility *= s.time_step**2  # from a step of 1 s
         if self.scales_mass:
             required *= s.time_step**2
             self._raise_mass(required)
+
+    def _needed(self, required: NDArray[np.float64]) -> float:
+        """The most of its mass that a node of this rank needs."""
+        return float((required * self.state.mobility).max()) / self.state.time_step**2
 
     def _largest(self, value: float) -> float:
         return float(self.world.gather([value]).max())
@@ -149,7 +154,7 @@ class March:
         rehearse(twin.state, (*self.forces, *self.motion))
         twin.look()
         self.state.rest()
-        self.state.mass[:] = self.sub.rows.read("mass")
+        np.divide(self.state.time_step**2, self.sub.rows.read("mass"), out=self.state.mobility)
 
     def look(self) -> dict[str, float]:
         """This rank's share of the figures at the present time, for which the forces are there.
@@ -161,8 +166,8 @@ class March:
         s, owned = self.state, self.sub.rows.owned
         found = self.survey.look(s, self.safety)
         required = self._required()
-        found["kinetic"] = kernels.kinetic_energy(s.u, s.u_prev, s.f, s.mass, s.mobility, owned, self.held, s.time_step)
-        found["step_ratio"] = self.safety * float(np.sqrt((required / s.mass).max()))
+        found["kinetic"] = kernels.kinetic_energy(s.u, s.u_prev, s.f, s.mobility, owned, self.held)
+        found["step_ratio"] = self.safety * math.sqrt(self._needed(required))
         if self.scales_mass:
             self._raise_mass(required)
         return found | {
@@ -174,28 +179,34 @@ class March:
 
     def _raise_mass(self, required: NDArray[np.float64]) -> None:
         s = self.state
-        mass, energy = kernels.raise_mass(s.u, s.u_prev, s.mass, s.mobility, required, self.sub.rows.owned, s.time_step)
+        mass, energy = kernels.raise_mass(s.u, s.u_prev, s.mobility, required, self.sub.rows.owned, s.time_step)
         self.added_mass += mass
         self.added_energy += energy
 
     def _required(self) -> NDArray[np.float64]:
-        """Mass (kg) that each node needs after a survey, on all ranks; renews now and then how sharp its bound is."""
-        s, required = self.state, self.survey.required[0]
+        """Mass (kg) that each node needs after a survey, on all ranks."""
+        required = self.survey.required[0]
         if self.halo is not None:
             self.halo.sum(self.survey.required)
         required[self.prescribed] = 0
-        if self.sharpness.due():
-            mobility, bound = s.mobility, (2 * self.safety) ** 2
-            if self.scales_mass:
-                mobility = np.divide(s.time_step**2, required, out=np.zeros_like(required), where=required > 0)
-            else:
-                bound *= self._largest((required / s.mass).max())
-            self.sharpness.renew(s, mobility[None], bound)
-        required *= self.sharpness.share
+        required *= self.sharpness.share or 1.0
         return required
 
+    def _sharpen(self) -> float:
+        """Renew how sharp the bound is, of which `required` is this share; by what factor the stable step shrank."""
+        s, required, share = self.state, self.survey.required[0], self.sharpness.share or 1.0
+        mobility, bound = s.mobility, (2 * self.safety) ** 2 / share
+        if self.scales_mass:
+            mobility = np.divide(s.time_step**2, required, out=np.zeros_like(required), where=required > 0)
+        else:
+            bound *= self._largest(self._needed(required))
+        self.sharpness.renew(s, mobility[None], bound, s.good)
+        grown = self.sharpness.share / share
+        required *= grown
+        return math.sqrt(grown)
+
     def decide(self, figures: dict[str, float]) -> tuple[bool, bool]:
-        """The length of the next steps; whether a frame is due now, and whether it is the last."""
+        """The length of the next steps; whether a frame is due now, and whether it is the last. Spoils `State.good`."""
         s = self.state
         due = s.time >= self.frame * self.frame_span - 0.5 * s.time_step
         if due:
@@ -203,6 +214,11 @@ class March:
             self.frame += 1
         if s.time >= self.end - 0.5 * s.time_step:
             return due, True
+        # Only now: it needs the room of the last good state, which this one is.
+        if self.sharpness.due():
+            figures["step_ratio"] *= self._sharpen()
+            if self.scales_mass:
+                self._raise_mass(self.survey.required[0])
         shrunk = figures["step_ratio"] / self.safety
         allowed = self.longest if self.scales_mass else min(self.longest, s.time_step / shrunk)
         longer = False
@@ -227,6 +243,6 @@ class March:
         ratio = time_step / s.time_step
         if abs(ratio - 1) < 1e-12:
             return
-        np.divide(time_step**2, s.mass, out=s.mobility)
+        s.mobility *= ratio**2
         kernels.change_step(s.u, s.u_prev, s.f, s.mobility, ratio)
         s.time_step = time_step

@@ -48,7 +48,7 @@ class Relaxation:
 
     #: Beside the state: what an unstable run goes back to, and what stays as it is when it does.
     PASSING = Kept(
-        nodes=("u_then", "f_then"),
+        nodes=("mass", "u_then", "f_then"),
         alike=("lowest", "distance", "frame", "settled", "best", "best_lowest", "waited"),
     )
     LASTING = Kept(alike=("safety", "between", "load_time"))
@@ -76,14 +76,14 @@ class Relaxation:
         self.survey = Survey(sub)
         components = self.components(sub)
         self.required = self.survey.required if components == 1 else np.zeros((components, sub.n_nodes))
-        self.state.mass, self.state.mobility = (np.zeros((components, sub.n_nodes)) for _ in range(2))
+        self.mass, self.state.mobility = (np.zeros((components, sub.n_nodes)) for _ in range(2))
         self.free = sub.free()
         self.counted: NDArray[np.bool_] = self.free & sub.rows.owned  # free dofs that this rank owns
         self.u_then, self.f_then = np.zeros((3, sub.n_nodes)), np.zeros((3, sub.n_nodes))
         self.lowest, self.distance, self.frame, self.settled = 0.0, math.inf, 0, 0
         self.best, self.best_lowest, self.waited = math.inf, 0.0, 0
         self.forces, self.motion = compose_forces(sub, force_halo), compose_relaxation(sub, self.counted)
-        self.sharpness = Sharpness(sub, world, self.forces, self.free)
+        self.sharpness = Sharpness(sub, world, self.forces)
 
     @staticmethod
     def components(sub: Subdomain) -> int:
@@ -155,7 +155,7 @@ class Relaxation:
         rehearse(twin.state, (*self.forces, *self.motion))
         twin.look()
         self.state.rest()
-        for array in (self.state.mass, self.state.mobility, self.u_then, self.f_then):
+        for array in (self.mass, self.state.mobility, self.u_then, self.f_then):
             array[:] = 0
 
     def look(self) -> dict[str, float]:
@@ -165,10 +165,10 @@ class Relaxation:
         """
         s = self.state
         found = self._bound()
-        kernels.keep_masses(s.mass, self.required, self.free, KEEP)
-        kernels.invert_masses(s.mass, self.free, s.mobility)
+        kernels.keep_masses(self.mass, self.required, self.free, KEEP)
+        kernels.invert_masses(self.mass, self.free, s.mobility)
         kinetic, work, force, mass, change, residual = kernels.watch_relaxation(
-            s.u, s.u_prev, s.f, s.mass, s.mobility, self.counted, self.u_then, self.f_then
+            s.u, s.u_prev, s.f, self.mass, s.mobility, self.counted, self.u_then, self.f_then
         )
         return found | {
             "kinetic": kinetic,
@@ -189,7 +189,7 @@ class Relaxation:
         anew: from where the load began, with masses and watch as at first.
         """
         self.state.place(self.state.u)
-        self.state.mass[:] = 0
+        self.mass[:] = 0
         self.u_then[:] = self.state.u[:, : self.sub.n_nodes]
         self.safety = self.first_safety if anew else self.safety / math.sqrt(2)
         self.between = BETWEEN if anew else max(1, self.between // 2)
@@ -212,7 +212,8 @@ class Relaxation:
         if self.sharpness.due() and (s.share < 1 or self.sharpness.share == 0):
             # Where the looking goes on, the mobility that lasts is made of what is found.
             kernels.invert_masses(self.required, self.free, s.mobility)
-            self.sharpness.renew(s, s.mobility, (2 * self.safety) ** 2)
+            mode = np.empty(s.good.shape, s.good.dtype)  # for it is not known yet whether this state is good
+            self.sharpness.renew(s, s.mobility, (2 * self.safety) ** 2, mode)
         self.required *= self.sharpness.share
         return found
 

@@ -85,10 +85,7 @@ class Run:
         self.saved: deque[Memory] = deque(maxlen=2)  # to go back to the older of them; the younger may be ill already
         self.start: Memory = {}  # the numbers of the first, at no load
         self.first_step, self.next_checkpoint = 0, math.inf
-        # The displacements that were good at the last look, in single precision, their frame's time, and what was seen
-        # of them.
-        self.good, self.good_time = np.zeros((3, sub.n_nodes), np.float32), 0.0
-        self.good_figures = self.watch.figures
+        self.good_time, self.good_figures = 0.0, self.watch.figures  # of `State.good`: its frame's time, what was seen
 
     def _halo(self, components: int, precision: type[np.floating] = np.float64) -> Halo | None:
         if self.world.size == 1:
@@ -238,6 +235,8 @@ class Run:
                 method.harden(anew)
                 self._take(method.forces)
         due, last = method.decide(self.watch.figures)
+        method.state.good[:] = method.state.u[:, : self.sub.n_nodes]
+        self.good_time, self.good_figures = method.frame_time, self.watch.figures
         if due and self.loaded is None:
             with self.phases("output"):
                 self._write(writer, method.frame_time)
@@ -263,14 +262,12 @@ class Run:
         self.watch.look(method, END if self.interrupts.asked else asked)
         if self.progress and self.loaded is None:
             self.progress.show(method.progress, method.state.step, self.watch.figures)
-        self.good[:] = method.state.u[:, : self.sub.n_nodes]
-        self.good_time, self.good_figures = method.frame_time, self.watch.figures
 
     def _write_last_good(self, writer: store.ResultWriter) -> None:
         """As one more frame of a run that cannot go on, unless it is there already."""
         if self.loaded is not None or self.good_time <= self.written:
             return
-        self.method.state.place(self.good)
+        self.method.state.place(self.method.state.good)
         self.method.survey.look(self.method.state, self.method.safety)
         self.watch.figures = self.good_figures
         self._write(writer, self.good_time)
@@ -335,7 +332,7 @@ class Run:
             self.saved.append(healthy)
         recall(self._passing, read("present", self._passing) or {})
         self.method.state.show()
-        self.good[:] = self.method.state.u[:, : self.sub.n_nodes]
+        self.method.state.good[:] = self.method.state.u[:, : self.sub.n_nodes]
         self.first_step = self.method.state.step
         if self.loaded is None:
             self._tell(f"goes on from step {self.first_step:,} ({self.method.progress:.1%})")
@@ -424,9 +421,7 @@ class Run:
         field = np.where(rows.owned & (rows.nodes < rows.n_fe_nodes), u, 0.0)
         domains = rows.read("cells", rows.n_own_hexahedra) - rows.n_hexahedra
         giving = self.sub.domain_nodes[np.searchsorted(domains, rows.field_domains)]
-        field[:, np.searchsorted(rows.nodes, rows.field_nodes)] = np.einsum(
-            "ga,cga->cg", rows.field_shapes, u[:, giving]
-        )
+        field[:, rows.local(rows.field_nodes)] = np.einsum("ga,cga->cg", rows.field_shapes, u[:, giving])
         if self.force_halo is not None:
             self.force_halo.sum(field)
         return field

@@ -34,9 +34,10 @@ class Sharpness:
 
     LASTING = Kept(alike=("share", "wait"))
 
-    def __init__(self, sub: Subdomain, world: World, forces: tuple[Term, ...], free: NDArray[np.bool_]) -> None:
-        """free (3, n_nodes): see `Subdomain.free`."""
-        self._sub, self._world, self._forces, self._free = sub, world, forces, free
+    def __init__(self, sub: Subdomain, world: World, forces: tuple[Term, ...]) -> None:
+        self._sub, self._world, self._forces = sub, world, forces
+        held = np.concatenate([sub.fixed, sub.moving])
+        self._held = held % 3, held // 3
         self.share = 0.0  # of the bound, that the operator has had at most
         self.wait = 0  # surveys until it is looked for again
         spread = float(np.ptp(sub.rows.read("points"), axis=0).max()) if sub.n_nodes else 0.0
@@ -54,25 +55,29 @@ class Sharpness:
         self.wait -= 1
         return self.wait < 0
 
-    def renew(self, s: State, mobility: NDArray[np.float64], bound: float) -> None:
-        """The share that the largest eigenvalue of `mobility` K has of its bound (alike), and when to ask again."""
-        found = self.largest_eigenvalue(s, mobility) / bound if bound > 0 else 0.0
+    def renew(self, s: State, mobility: NDArray[np.float64], bound: float, mode: NDArray[np.float32]) -> None:
+        """The share that the largest eigenvalue of `mobility` K has of its bound (alike), and when to ask again.
+
+        mode: as in `largest_eigenvalue`.
+        """
+        found = self.largest_eigenvalue(s, mobility, mode) / bound if bound > 0 else 0.0
         # Small displacements may have changed in their last bits: a run that is continued begins with their forces.
         s.f[:] = 0
         self._take(s)
         self.wait = 0 if found > GROWS * self.share else SELDOM - 1
         self.share = min(1.0, max(self.share, found)) or 1.0  # where nothing is free nothing is found
 
-    def largest_eigenvalue(self, s: State, mobility: NDArray[np.float64]) -> float:
+    def largest_eigenvalue(self, s: State, mobility: NDArray[np.float64], mode: NDArray[np.float32]) -> float:
         """Largest eigenvalue (1/s^2 times the mobility's dt^2) of `mobility` K at the displacements of s, from below.
 
         s has the forces of its displacements, which may change in their last bits. mobility, s^2/kg: (1, n_nodes), or
-        symmetric tensors (6, n_nodes); 0 where it does not matter.
+        symmetric tensors (6, n_nodes); 0 where it does not matter. mode (3, n_nodes): room for the trial displacements.
         """
         rows, trial = self._sub.rows, copy(s)
         trial.f = np.empty_like(s.f)
-        mode = np.empty((3, self._sub.n_nodes), np.float32)  # whatever it is, it is tried as it is
-        kernels.scramble(mode, rows.nodes, self._free)
+        # The mode has less than the displacements' precision, for whatever it is, it is tried as it is.
+        kernels.scramble(mode, rows.nodes)
+        mode[self._held] = 0
         size, weight, found = self._largest(np.abs(mode).max(initial=0.0)), 0.0, 0.0
         for iteration in range(AGAIN if self.share else FIRST):
             if not 0 < size < math.inf:
@@ -85,7 +90,8 @@ class Sharpness:
             self._take(trial)
             kernels.perturb(s.u, mode, -scale if s.seen is s.u else 0.0, s.seen)
             # The mode becomes mobility times its response, so that the response times it is mode . M mode.
-            sums = kernels.respond(mode, trial.f, s.f, mobility, self._free, rows.owned, self._reach, size)
+            trial.f[self._held] = s.f[self._held]
+            sums = kernels.respond(mode, trial.f, s.f, mobility, rows.owned, self._reach, size)
             table = self._world.gather(sums)
             quotient, last = float(table[:, 0].sum()), found
             if iteration > 0 and weight > 0:

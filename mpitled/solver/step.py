@@ -22,7 +22,7 @@ class State:
 
     #: `seen` and `f` follow from u.
     KEPT: ClassVar = Kept(
-        nodes=("u", "u_prev", "mass", "mobility"),
+        nodes=("u", "u_prev", "mobility"),
         moving=("reaction",),
         sums=("external_work", "free_work"),
         least=("smallest_jacobian",),
@@ -35,9 +35,9 @@ class State:
     u_prev: NDArray[np.float64]  # (3, n_nodes + PADDING), m, one step before
     seen: NDArray[np.floating]  # u as the cells read it: u itself, or its copy in single precision
     f: NDArray[np.floating]  # (3, n_nodes + PADDING), N, internal forces, in the precision of `seen`
-    mass: NDArray[np.float64]  # (n_nodes,), kg, as scaled; in relaxation (6, n_nodes), its symmetric tensor
-    mobility: NDArray[np.float64]  # as mass, s^2/kg: dt^2 times its inverse
+    mobility: NDArray[np.float64]  # (n_nodes,), s^2/kg: dt^2 / m, m as scaled; in relaxation its tensors (6, n_nodes)
     reaction: NDArray[np.float64]  # (n owned moving dofs,), N
+    good: NDArray[np.float32]  # (3, n_nodes), m, the last displacements that were found good; room between steps
     load_time: float  # s
     time_step: float  # s
     time: float = 0.0  # s
@@ -82,9 +82,10 @@ def at_rest(sub: Subdomain, load_time: float, time_step: float) -> State:
     u, u_prev = (np.zeros((3, sub.n_nodes + kernels.PADDING)) for _ in range(2))
     seen = u if sub.precision == u.dtype else u.astype(sub.precision)
     f = np.zeros_like(seen)
-    mass = sub.rows.read("mass").copy()  # columns in memory stay as they are
+    mobility = time_step**2 / sub.rows.read("mass")
     owned_moving = int(np.count_nonzero(sub.rows.owned[sub.moving // 3]))
-    return State(u, u_prev, seen, f, mass, time_step**2 / mass, np.zeros(owned_moving), load_time, time_step)
+    good = np.zeros((3, sub.n_nodes), np.float32)
+    return State(u, u_prev, seen, f, mobility, np.zeros(owned_moving), good, load_time, time_step)
 
 
 def compose_forces(sub: Subdomain, halo: Halo | None) -> tuple[Term, ...]:
@@ -177,9 +178,7 @@ def compose_march(sub: Subdomain) -> tuple[Term, ...]:
     m, (copied, advance) = _compose_motion(sub), _compose_copy(sub)
 
     def reactions(s: State) -> None:
-        s.external_work += kernels.react(
-            s.u, s.u_prev, s.f, s.mass, m.dofs, m.own_full, m.own_share(s), s.reaction, s.time_step
-        )
+        s.external_work += kernels.react(s.u, s.u_prev, s.f, s.mobility, m.dofs, m.own_full, m.own_share(s), s.reaction)
 
     def update(s: State) -> None:
         kernels.update(s.u, s.u_prev, s.f, s.mobility, sub.fixed, sub.moving, m.full, m.share(s), copied(s))
@@ -193,9 +192,7 @@ def compose_relaxation(sub: Subdomain, counted: NDArray[np.bool_]) -> tuple[Term
     m, (copied, advance) = _compose_motion(sub), _compose_copy(sub)
 
     def reactions(s: State) -> None:
-        s.external_work += kernels.react(
-            s.u, s.u_prev, s.f, None, m.dofs, m.own_full, m.own_share(s), s.reaction, s.time_step
-        )
+        s.external_work += kernels.react(s.u, s.u_prev, s.f, None, m.dofs, m.own_full, m.own_share(s), s.reaction)
 
     def relax(s: State) -> None:
         s.free_work += kernels.relax(

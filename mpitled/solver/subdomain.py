@@ -123,7 +123,7 @@ class Subdomain:
         steepest = 0.0
         for kind in ("hexahedra", "domains"):
             for first, nodes in rows.blocks(kind):
-                cells = np.searchsorted(rows.nodes, nodes)
+                cells = rows.local(nodes)
                 near = moves[cells].any(axis=1)
                 if near.any():
                     if kind == "hexahedra":
@@ -146,7 +146,7 @@ def localise(
     """
 
     def local(nodes: NDArray[np.int64]) -> NDArray[np.uint32]:
-        return np.searchsorted(rows.nodes, nodes).astype(np.uint32, copy=False)
+        return rows.local(nodes).astype(np.uint32, copy=False)
 
     n_hexahedra, points, material = rows.n_own_hexahedra, rows.read("points"), rows.read("material")
     lame = np.array([[m.mu, m.lam] for m in rows.materials]).T  # (2, n_materials)

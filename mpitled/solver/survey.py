@@ -21,11 +21,11 @@ class Survey:
     """
 
     sub: Subdomain
-    jacobian: NDArray[np.float64] = field(init=False)  # (n_cells + 1,), the last for lanes without a cell
+    jacobian: NDArray[np.float32] = field(init=False)  # (n_cells + 1,), the last for lanes without a cell
     required: NDArray[np.float64] = field(init=False)  # (1, n_nodes), kg
 
     def __post_init__(self) -> None:
-        self.jacobian = np.ones(self.sub.n_cells + 1)
+        self.jacobian = np.ones(self.sub.n_cells + 1, np.float32)
         self.required = np.zeros((1, self.sub.n_nodes))
 
     def look(self, s: State, safety: float, tensor: NDArray[np.float64] | None = None) -> dict[str, float]:

@@ -82,7 +82,7 @@ class Watch:
         cell = int(np.argmin(np.where(np.isnan(jacobian), -np.inf, jacobian)))
         hexahedron = cell < rows.n_own_hexahedra
         kind, k = ("hexahedra", cell) if hexahedron else ("domains", cell - rows.n_own_hexahedra)
-        local = np.searchsorted(rows.nodes, rows.read(kind, k, k + 1)[0])
+        local = rows.local(rows.read(kind, k, k + 1)[0])
         points = rows.read("points")[local]
         x, y, z = 1e3 * (points.mean(axis=0) if hexahedron else rows.read("domain_points", k, k + 1)[0])
         edges = points - points.mean(axis=0)

@@ -180,7 +180,7 @@ def reasons(deck: Deck, sub: Subdomain, ranks: int) -> dict[str, str]:
 _ABSENT: dict[str, Callable[[Deck], str]] = {
     "position": lambda deck: f"support.stabilisation = {deck.support.stabilisation:g}",
     "inverse": lambda deck: f"support.stabilisation = {deck.support.stabilisation:g}",
-    "mass": lambda deck: "relaxation has no inertia where nodes are moved",
+    "mobility": lambda deck: "relaxation has no inertia where nodes are moved",
     "copied": lambda deck: f'solver.precision = "{deck.solver.precision}"',
     "tensor": lambda deck: f'solver.method = "{deck.solver.method}": masses are scalars',
 }

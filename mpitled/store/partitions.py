@@ -107,7 +107,7 @@ class PartRows:
     n_domains: int  # of the whole model
     n_own_hexahedra: int
     n_own_domains: int
-    nodes: NDArray[np.int64]  # (k,) ascending nodes that the part's cells touch
+    nodes: NDArray[np.signedinteger]  # (k,) ascending nodes that the part's cells touch; int32 as far as it goes
     owned: NDArray[np.bool_]  # (k,)
     first_row: int  # row of the first owned node; owned nodes follow each other
     materials: tuple[Material, ...]
@@ -136,6 +136,11 @@ class PartRows:
         }
         return lengths[_COLUMNS[name]]
 
+    def local(self, nodes: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Places of nodes in `nodes`, where they have to be."""
+        # Of its own type, or numpy would make `nodes` anew of the other.
+        return np.searchsorted(self.nodes, nodes.astype(self.nodes.dtype, copy=False))
+
     def read(self, name: str, first: int = 0, last: int | None = None) -> NDArray[Any]:
         """Rows first to last of a long column, from the file. InputError if it cannot be read any more."""
         return self.source(name, first, self.length(name) if last is None else last)
@@ -158,7 +163,7 @@ class PartRows:
 class _File:
     """The long columns of one part in an open model; it stays open, whatever becomes of its name."""
 
-    def __init__(self, path: Path, n_parts: int, part: int, nodes: NDArray[np.int64]) -> None:
+    def __init__(self, path: Path, n_parts: int, part: int, nodes: NDArray[np.signedinteger]) -> None:
         """nodes: of the part, ascending."""
         self._file, self._path, self._nodes = open_file(path), path, nodes
         self._group = None if n_parts == 1 else self._file[f"partitions/{n_parts}"]
@@ -195,7 +200,7 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
     with open_model(path) as file:
         n_nodes, n_hexahedra, n_domains = (len(file[name]) for name in ("points", "hexahedra", "domains"))
         if n_parts == 1:
-            nodes = rows = np.arange(n_nodes)
+            nodes = rows = _numbers(np.arange(n_nodes), n_nodes)
             source = _File(path, n_parts, part, nodes)
             n_own_hexahedra, n_own_cells = n_hexahedra, n_hexahedra + n_domains
             own_domains = np.arange(n_domains)
@@ -225,6 +230,7 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
                 check_ascending(numbers, name)
             if part in neighbours or not np.isin(shared, nodes).all():
                 raise ValueError("a part shares with itself, or nodes that are not its own")
+            nodes = _numbers(nodes, n_nodes)
             source = _File(path, n_parts, part, nodes)
             n_own_hexahedra, n_own_cells = source.n_own_hexahedra, len(cells)
             own_domains = cells[n_own_hexahedra:] - n_hexahedra
@@ -262,6 +268,11 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
         return part_rows
 
 
+def _numbers(nodes: NDArray[np.int64], n_nodes: int) -> NDArray[np.signedinteger]:
+    """In half the room where a model has no more than 2^31 nodes."""
+    return nodes.astype(np.int32) if n_nodes <= np.iinfo(np.int32).max else nodes
+
+
 def _check_columns(part: PartRows) -> None:
     """ValueError unless the long columns hold what they may."""
     for name in _COLUMNS:
@@ -269,7 +280,7 @@ def _check_columns(part: PartRows) -> None:
             if name in ("hexahedra", "domains"):
                 # As `localise` will find them: a node of which this part has no copy would be beyond its arrays.
                 check_numbers(values, part.n_nodes, name)
-                if not (part.nodes.take(np.searchsorted(part.nodes, values), mode="clip") == values).all():
+                if not (part.nodes.take(part.local(values), mode="clip") == values).all():
                     raise ValueError(f"{name} have nodes that their part has not")
             elif name == "material":
                 check_numbers(values, len(part.materials), name)

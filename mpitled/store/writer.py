@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -57,6 +58,10 @@ def result_bytes(rows: PartRows, n_frames: int) -> int:
     size = sum(_POINT_BYTES[k] * n_points * n for k, n in enumerate((1, n_frames)))
     size += sum(_CELL_BYTES[k] * (n_hexahedra + n_vertices) * n for k, n in enumerate((1, n_frames)))
     return size + _CORNER_BYTES * (8 * n_hexahedra + n_vertices) + _FRAME_BYTES * n_frames + _ON_TOP
+
+
+#: Rows first to last of a column.
+Rows = Callable[[int, int], NDArray[Any]]
 
 
 class ResultWriter:
@@ -190,7 +195,7 @@ class ResultWriter:
         self,
         time: float,
         point_data: Mapping[str, NDArray[np.float64]],
-        cell_data: Mapping[str, NDArray[np.float64]],
+        cell_data: Mapping[str, NDArray[np.floating]],
         series: Mapping[str, float] | None = None,
     ) -> None:
         """Write one frame; it counts once it is on its way to the disc.
@@ -207,11 +212,16 @@ class ResultWriter:
         shares = {"series": checksum.share(series_of(time, series or {}), 0) if self._leads else 0}
         with writing(self._partial):
             for name, values in point_data.items():
-                pieces = np.split(values, [self._n_owned])
-                shares[f"PointData/{name}"] = self._write(grid["PointData"][name], self._point_slabs, pieces, point_row)
-            for name, values in cell_data.items():
-                shares[f"CellData/{name}"] = self._write(
-                    grid["CellData"][name], self._cell_slabs, self._with_efg(values, np.nan), cell_row
+                of_nodes, at_points = np.split(values, [self._n_owned])
+                shares[f"PointData/{name}"] = self._write_points(
+                    grid["PointData"][name], self._n_owned, partial(_rows_of, of_nodes), at_points, point_row
+                )
+            for name, of_cells in cell_data.items():
+                of_hexahedra, of_domains = np.split(of_cells, [self._part.n_own_hexahedra])
+                # No cells of the model are the vertices of EFG nodes.
+                between = np.full((self._n_efg, *of_cells.shape[1:]), np.nan, of_cells.dtype)
+                shares[f"CellData/{name}"] = self._write_cells(
+                    grid["CellData"][name], partial(_rows_of, of_hexahedra), [between, of_domains], cell_row
                 )
             totals = self._totals(shares)
             if self._leads:
@@ -286,63 +296,78 @@ class ResultWriter:
         self._cell_slabs = slabs_of(totals[1:], before[1:], counts[1:])
 
     def _write_mesh(self) -> None:
-        part, counts, totals, before = self._part, self._counts, self._all_counts, self._counts_before
-        owned = part.owned
-        efg = owned & (part.nodes >= part.n_fe_nodes)
-        sizes = np.array([8, 1, 1])
-        corner_slabs = slabs_of(sizes * totals[1:], sizes * before[1:], sizes * counts[1:])
-        integration_rows = totals[0] + before[3] + np.arange(counts[3])
-        rows = part.read("rows")
-        # Offsets say where each cell's corners end, after a first row that says where they begin.
-        ends = [
-            first + size * np.arange(1, n // size + 1) for (first, n), size in zip(corner_slabs, sizes, strict=True)
-        ]
-        end_slabs = [(first + 1, n) for first, n in self._cell_slabs]
-        if part.part == 0:
-            ends, end_slabs = [np.zeros(1, np.int64), *ends], [(0, 1), *end_slabs]
-
+        corners = np.array([8, 1, 1])  # of each kind of cell
+        totals, before, counts = (corners * n[1:] for n in (self._all_counts, self._counts_before, self._counts))
+        corner_slabs, n_corners = slabs_of(totals, before, counts), int(totals.sum())
         grid = self._file.create_group("VTKHDF")
         grid.attrs["Version"] = np.array([2, 0])
         grid.attrs["Type"] = np.bytes_("UnstructuredGrid")
-        n_corners = int((sizes * totals[1:]).sum())
         self._table(grid, "NumberOfPoints", [self._n_points])
         self._table(grid, "NumberOfCells", [self._n_cells])
         self._table(grid, "NumberOfConnectivityIds", [n_corners])
+        self._write_connectivity(make(grid, "Connectivity", (n_corners,), np.int64), corner_slabs)
+        self._write_offsets(make(grid, "Offsets", (self._n_cells + 1,), np.int64), corner_slabs)
+        self._write_point_columns(grid)
+        self._write_cell_columns(grid)
 
-        def write(name: str, slabs: Slabs, n_rows: int, pieces: Sequence[NDArray[Any]]) -> None:
-            made = make(grid, name, (n_rows, *pieces[0].shape[1:]), pieces[0].dtype)
-            self._shares[name] = self._write(made, slabs, pieces)
+    def _write_connectivity(self, made: h5py.Dataset, slabs: Slabs) -> None:
+        part = self._part
+        rows = part.read("rows")
+        efg = part.owned & (part.nodes >= part.n_fe_nodes)
+        at_points = self._all_counts[0] + self._counts_before[3] + np.arange(self._counts[3])
+        (first_corner, _), *others = slabs
 
-        def of_kinds(values: Sequence[int], dtype: Any) -> list[NDArray[Any]]:
-            return [np.full(n, value, dtype) for value, n in zip(values, counts[1:], strict=True)]
+        def of_hexahedra(first: int, last: int) -> NDArray[np.int64]:
+            return rows[part.local(part.read("hexahedra", first, last))].ravel()
 
-        # What is longest goes by blocks, as many on all ranks.
-        made = _with_units(make(grid, "Points", (self._n_points, 3), np.float64))
-        (row, _), of_domains = self._point_slabs
-        share = self._write(made, [of_domains], [part.read("domain_points")])
-        for first, last in _blocks(len(part.nodes), self._most_nodes):
-            points = part.read("points", first, last)[owned[first:last]]
-            share += self._write(made, [(row, len(points))], [points])
-            row += len(points)
-        self._shares["Points"] = share
-        made = make(grid, "Connectivity", (n_corners,), np.int64)
-        share = self._write(made, corner_slabs[1:], [rows[efg], integration_rows])
-        for first, last in _blocks(part.n_own_hexahedra, self._most_hexahedra):
-            corners = rows[np.searchsorted(part.nodes, part.read("hexahedra", first, last))].ravel()
-            share += self._write(made, [(corner_slabs[0][0] + 8 * first, len(corners))], [corners])
-        self._shares["Connectivity"] = share
-        write("Offsets", end_slabs, self._n_cells + 1, ends)
-        write("Types", self._cell_slabs, self._n_cells, of_kinds((_VTK_HEXAHEDRON, _VTK_VERTEX, _VTK_VERTEX), np.uint8))
-        none = np.full(counts[3], -1)
-        for name, of_nodes in (("node_id", part.nodes), ("node_label", part.read("node_ids"))):
-            write(f"PointData/{name}", self._point_slabs, self._n_points, [of_nodes[owned], none])
-        for name, of_cells in (
-            ("cell_id", self._with_efg(part.read("cells"), -1)),
-            ("material", self._with_efg(part.read("material"), -1)),
-            ("kind", of_kinds((HEXAHEDRON, EFG_NODE, INTEGRATION_POINT), np.uint8)),
-            ("part", of_kinds((part.part,) * 3, np.int32)),
+        share = self._write(made, others, [rows[efg], at_points])
+        length, most = part.n_own_hexahedra, self._most_hexahedra
+        self._shares["Connectivity"] = share + self._write_long(made, first_corner, length, most, of_hexahedra)
+
+    def _write_offsets(self, made: h5py.Dataset, slabs: Slabs) -> None:
+        """Where each cell's corners end, after a first row that says where they begin."""
+        begin = np.zeros(int(self._leads), np.int64)
+        (first_corner, _), *others = slabs
+        ends = [first + np.arange(1, n + 1) for first, n in others]
+
+        def of_hexahedra(first: int, last: int) -> NDArray[np.int64]:
+            return first_corner + 8 * np.arange(first + 1, last + 1)
+
+        (row, length), *rows = ((row + 1, n) for row, n in self._cell_slabs)
+        share = self._write(made, [(0, len(begin)), *rows], [begin, *ends])
+        self._shares["Offsets"] = share + self._write_long(made, row, length, self._most_hexahedra, of_hexahedra)
+
+    def _write_point_columns(self, grid: h5py.Group) -> None:
+        part, owned = self._part, self._part.owned
+        none = np.full(part.n_own_domains, -1)
+        columns: list[tuple[str, Any, Rows, NDArray[Any]]] = [
+            ("Points", np.float64, partial(part.read, "points"), part.read("domain_points")),
+            ("PointData/node_id", np.int64, partial(_rows_of, part.nodes), none),
+            ("PointData/node_label", np.int64, partial(part.read, "node_ids"), none),
+        ]
+        for name, dtype, of_nodes, at_points in columns:
+            made = _with_units(make(grid, name, (self._n_points, *at_points.shape[1:]), dtype))
+
+            def of_owned(first: int, last: int, of_nodes: Rows = of_nodes) -> NDArray[Any]:
+                return of_nodes(first, last)[owned[first:last]]
+
+            self._shares[name] = self._write_points(made, len(part.nodes), of_owned, at_points)
+
+    def _write_cell_columns(self, grid: h5py.Group) -> None:
+        part, none = self._part, np.full(self._n_efg, -1)
+        columns: list[tuple[str, Any, Rows, list[NDArray[Any]]]] = [
+            (f"CellData/{name}", dtype, partial(part.read, column), [none, part.read(column, part.n_own_hexahedra)])
+            for name, dtype, column in (("cell_id", np.int64, "cells"), ("material", np.int16, "material"))
+        ]
+        for name, dtype, (of_hexahedra, *of_others) in (
+            ("Types", np.uint8, (_VTK_HEXAHEDRON, _VTK_VERTEX, _VTK_VERTEX)),
+            ("CellData/kind", np.uint8, (HEXAHEDRON, EFG_NODE, INTEGRATION_POINT)),
+            ("CellData/part", np.int32, (part.part, part.part, part.part)),
         ):
-            write(f"CellData/{name}", self._cell_slabs, self._n_cells, of_cells)
+            numbers = [np.full(n, value) for n, value in zip(self._counts[2:], of_others, strict=True)]
+            columns.append((name, dtype, partial(_alike, of_hexahedra), numbers))
+        for name, dtype, rows, others in columns:
+            self._shares[name] = self._write_cells(make(grid, name, (self._n_cells,), dtype), rows, others)
 
     def _make_steps(self, point_data: Mapping[str, int], cell_data: Mapping[str, int], series: Sequence[str]) -> None:
         n = self._n_frames
@@ -376,12 +401,6 @@ class ResultWriter:
             self._table(steps, f"FieldDataOffsets/{name}", np.arange(n))
             self._table(steps, f"FieldDataSizes/{name}", np.ones((n, 2)))
 
-    def _with_efg(self, values: NDArray[Any], filler: float) -> list[NDArray[Any]]:
-        """Values of own cells with `filler` for the vertices of EFG nodes, which are no cells of the model."""
-        between = np.full((self._n_efg, *values.shape[1:]), filler, values.dtype)
-        of_hexahedra, of_domains = np.split(values, [self._part.n_own_hexahedra])
-        return [of_hexahedra, between, of_domains]
-
     def _table(self, group: h5py.Group, name: str, values: Any) -> None:
         """A small dataset of integers that all ranks make and the first writes."""
         dataset = make(group, name, np.shape(values), np.int64)
@@ -393,6 +412,37 @@ class ResultWriter:
     def _write(self, dataset: h5py.Dataset, slabs: Slabs, pieces: Sequence[NDArray[Any]], first_row: int = 0) -> int:
         return write_rows(dataset, slabs, pieces, first_row, self._transfer)
 
+    def _write_long(
+        self, dataset: h5py.Dataset, row: int, length: int, most: int, some: Rows, first_row: int = 0
+    ) -> int:
+        """Write what `some` gives of each block of a long column, from a row on; its share of the checksum.
+
+        In as many calls on all ranks, of which the longest has `most`: a copy of the whole would be among the largest
+        arrays of a run.
+        """
+        share = 0
+        for begin in range(0, most, BLOCK):
+            values = some(min(begin, length), min(begin + BLOCK, length))
+            share += self._write(dataset, [(row, len(values))], [values], first_row)
+            row += len(values)
+        return share
+
+    def _write_points(
+        self, dataset: h5py.Dataset, length: int, of_nodes: Rows, at_points: NDArray[Any], first_row: int = 0
+    ) -> int:
+        """Rows of owned nodes, by blocks of so many in all, and of integration points; their share of the checksum."""
+        (row, _), slab = self._point_slabs
+        share = self._write(dataset, [slab], [at_points], first_row)
+        return share + self._write_long(dataset, row, length, self._most_nodes, of_nodes, first_row)
+
+    def _write_cells(
+        self, dataset: h5py.Dataset, of_hexahedra: Rows, others: Sequence[NDArray[Any]], first_row: int = 0
+    ) -> int:
+        """Rows of own hexahedra, by blocks, and of EFG nodes and integration points; their share of the checksum."""
+        (row, length), *slabs = self._cell_slabs
+        share = self._write(dataset, slabs, others, first_row)
+        return share + self._write_long(dataset, row, length, self._most_hexahedra, of_hexahedra, first_row)
+
 
 def _with_units(dataset: h5py.Dataset) -> h5py.Dataset:
     """The same, which says what its numbers are in, if there is a unit."""
@@ -402,7 +452,9 @@ def _with_units(dataset: h5py.Dataset) -> h5py.Dataset:
     return dataset
 
 
-def _blocks(length: int, most: int) -> Iterator[tuple[int, int]]:
-    """First and last row of blocks of so many rows; where that is less than most, empty ones follow."""
-    for first in range(0, most, BLOCK):
-        yield min(first, length), min(first + BLOCK, length)
+def _rows_of(values: NDArray[Any], first: int, last: int) -> NDArray[Any]:
+    return values[first:last]
+
+
+def _alike(value: int, first: int, last: int) -> NDArray[Any]:
+    return np.full(last - first, value)

@@ -20,12 +20,12 @@ def follow(path, full, turns, amplitude):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def react(u, u_prev, f, mass, dofs, full, amplitude, reaction, time_step):  # type: ignore[no-untyped-def]
+def react(u, u_prev, f, mobility, dofs, full, amplitude, reaction):  # type: ignore[no-untyped-def]
     """Work (J) of the reactions at moving dofs over the last step, by the trapezoidal rule; renews the reactions.
 
     A reaction is f + m a, a being the central difference to the place that the dof is moved to next (4.2.1: the
-    displaced nodes take u_max d(t + dt)); where mass is None prescribed dofs have none. dofs, full (n,): 3 node +
-    direction and metres at full load.
+    displaced nodes take u_max d(t + dt)); where mobility, dt^2 / m, is None prescribed dofs have no mass. dofs, full
+    (n,): 3 node + direction and metres at full load.
     """
     work = 0.0
     for p in range(dofs.size):
@@ -34,8 +34,8 @@ def react(u, u_prev, f, mass, dofs, full, amplitude, reaction, time_step):  # ty
         now = u[c, node]
         before = u_prev[c, node]
         r = f[c, node]
-        if mass is not None:
-            r += mass[node] * (amplitude * full[p] - 2 * now + before) / (time_step * time_step)
+        if mobility is not None:
+            r += (amplitude * full[p] - 2 * now + before) / mobility[node]
         work += 0.5 * (r + reaction[p]) * (now - before)
         reaction[p] = r
     return work
@@ -141,7 +141,7 @@ def change_step(u, u_prev, f, mobility, ratio):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def kinetic_energy(u, u_prev, f, mass, mobility, counted, held, time_step):  # type: ignore[no-untyped-def]
+def kinetic_energy(u, u_prev, f, mobility, counted, held):  # type: ignore[no-untyped-def]
     """Kinetic energy (J) of the counted nodes at the middle of the two half steps around u.
 
     held (n,) are the prescribed dofs: theirs is taken from the last half step, for f does not move them.
@@ -152,20 +152,20 @@ def kinetic_energy(u, u_prev, f, mass, mobility, counted, held, time_step):  # t
         now = u[c]
         before = u_prev[c]
         fc = f[c]
-        for n in range(U(mass.size)):
+        for n in range(U(mobility.size)):
             v = now[n] - before[n] - half * mobility[n] * fc[n]
-            twice += counted[n] * mass[n] * v * v
+            twice += counted[n] * v * v / mobility[n]
     for p in range(held.size):
         n = held[p] // 3
         c = held[p] % 3
         v = u[c, n] - u_prev[c, n]
         w = v - half * mobility[n] * f[c, n]
-        twice += counted[n] * mass[n] * (v * v - w * w)
-    return 0.5 * twice / (time_step * time_step)
+        twice += counted[n] * (v * v - w * w) / mobility[n]
+    return 0.5 * twice
 
 
 @njit(cache=True)
-def raise_mass(u, u_prev, mass, mobility, required, counted, time_step):  # type: ignore[no-untyped-def]
+def raise_mass(u, u_prev, mobility, required, counted, time_step):  # type: ignore[no-untyped-def]
     """Raise each node's mass to what is required; added mass (kg, times 3 directions not counted) and energy (J).
 
     The nodes go on at their speed, so that 1/2 dm v^2 comes into the system: a line of the ledger of its own.
@@ -173,9 +173,8 @@ def raise_mass(u, u_prev, mass, mobility, required, counted, time_step):  # type
     added = 0.0
     energy = 0.0
     for n in range(required.size):
-        dm = required[n] - mass[n]
+        dm = required[n] - time_step * time_step / mobility[n]
         if dm > 0:
-            mass[n] = required[n]
             mobility[n] = time_step * time_step / required[n]
             if counted[n]:
                 added += dm
@@ -317,8 +316,8 @@ def scatter(some, nodes, values):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def scramble(mode, nodes, free):  # type: ignore[no-untyped-def]
-    """mode (3, n) <- numbers in [-0.5, 0.5) at free dofs, 0 at others; a hash of the nodes' global numbers (n,).
+def scramble(mode, nodes):  # type: ignore[no-untyped-def]
+    """mode (3, n) <- numbers in [-0.5, 0.5), a hash of the nodes' global numbers (n,).
 
     So they belong to the nodes, whatever rank these are on (the end of splitmix64; Steele, Lea and Flood 2014).
     """
@@ -328,7 +327,7 @@ def scramble(mode, nodes, free):  # type: ignore[no-untyped-def]
             x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
             x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
             x ^= x >> np.uint64(31)
-            mode[c, n] = np.float64(x >> np.uint64(11)) * 2.0**-53 - 0.5 if free[c, n] else 0.0
+            mode[c, n] = np.float64(x >> np.uint64(11)) * 2.0**-53 - 0.5
 
 
 @njit(cache=True)
@@ -343,20 +342,20 @@ def perturb(u, mode, scale, seen):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def respond(mode, f, at_rest, mobility, free, owned, reach, size):  # type: ignore[no-untyped-def]
+def respond(mode, f, at_rest, mobility, owned, reach, size):  # type: ignore[no-untyped-def]
     """A power iteration: the mode (3, n), of which reach / size was tried, becomes mobility times its response K mode.
 
-    f, at_rest (3, :), N, with and without what was tried. Returns, of free dofs that are owned, the sums of response
-    times mode over size and of response times the new mode; and the largest component of the new mode.
+    f, at_rest (3, :), N, with and without what was tried. Returns, of nodes that are owned, the sums of response times
+    mode over size and of response times the new mode; and the largest component of the new mode.
     """
     old = 0.0
     new = 0.0
     largest = 0.0
     per = 1 / reach
     for n in range(U(mode.shape[1])):
-        x = per * free[0, n] * (f[0, n] - at_rest[0, n])
-        y = per * free[1, n] * (f[1, n] - at_rest[1, n])
-        z = per * free[2, n] * (f[2, n] - at_rest[2, n])
+        x = per * (f[0, n] - at_rest[0, n])
+        y = per * (f[1, n] - at_rest[1, n])
+        z = per * (f[2, n] - at_rest[2, n])
         a, b, c = times(mobility, n, x, y, z)
         if owned[n]:
             old += mode[0, n] * x + mode[1, n] * y + mode[2, n] * z
