@@ -26,6 +26,7 @@ from mpitled.batch import launch
 from mpitled.deck import load_deck
 from mpitled.results import field
 from mpitled.solver.relaxation import Relaxation
+from mpitled.solver.step import take
 from mpitled.speed import forecast
 
 HERE = Path(__file__).parent
@@ -90,15 +91,13 @@ def reached(out: Path, deck: str, overrides: Sequence[str]) -> int:
     *reactions, update = relaxation.motion
     relaxation.begin()
     forces = (*relaxation.forces, *reactions)
-    for _, term in forces:
-        term(s)
+    take(s, forces)
     while not ended:
         distance = 1e3 * np.linalg.norm(s.u[:, : rest.shape[1]] - rest, axis=0).max()
         near = (near or s.step) if s.share >= 1 and distance <= NEAR else 0
         _, ended = relaxation.decide(relaxation.look())
         for _ in range(0 if ended else relaxation.between):
-            for _, term in (update, *forces):
-                term(s)
+            take(s, (update, *forces))
     return near
 
 

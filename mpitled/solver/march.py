@@ -15,7 +15,7 @@ from mpitled.solver import kernels
 from mpitled.solver.halo import Halo, World
 from mpitled.solver.memory import Kept
 from mpitled.solver.sharpness import Sharpness
-from mpitled.solver.step import State, at_rest, compose_forces, compose_march, rehearse
+from mpitled.solver.step import State, at_rest, compose_forces, compose_march, rehearse, take
 from mpitled.solver.subdomain import Subdomain
 from mpitled.solver.survey import Survey
 
@@ -77,8 +77,7 @@ class March:
     def begin(self) -> None:
         """Find the step. Collective. InputError, alike on all ranks, for a step that is too long."""
         s, solver = self.state, self.solver
-        for _, term in self.forces:
-            term(s)
+        take(s, self.forces)
         self.survey.look(s, self.safety)
         required = self._required()
         self._sharpen()

@@ -14,7 +14,7 @@ from mpitled.solver import kernels
 from mpitled.solver.halo import Halo, World
 from mpitled.solver.memory import Kept
 from mpitled.solver.sharpness import Sharpness
-from mpitled.solver.step import State, at_rest, compose_forces, compose_relaxation, rehearse
+from mpitled.solver.step import State, at_rest, compose_forces, compose_relaxation, rehearse, take
 from mpitled.solver.subdomain import Subdomain
 from mpitled.solver.survey import Survey
 
@@ -113,8 +113,7 @@ class Relaxation:
 
     def begin(self) -> None:
         """Find how sharp the bound of stiffness is. Collective."""
-        for _, term in self.forces:
-            term(self.state)
+        take(self.state, self.forces)
         self._bound()
         self.state.f[:] = 0
 

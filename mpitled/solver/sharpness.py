@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mpitled.solver import kernels
 from mpitled.solver.halo import World
 from mpitled.solver.memory import Kept
-from mpitled.solver.step import State, Term
+from mpitled.solver.step import State, Term, take
 from mpitled.solver.subdomain import Subdomain
 
 #: Most iterations at first, and later; and the growth of Rayleigh's quotient in one at which they end. It grows towards
@@ -63,7 +63,7 @@ class Sharpness:
         found = self.largest_eigenvalue(s, mobility, mode) / bound if bound > 0 else 0.0
         # Small displacements may have changed in their last bits: a run that is continued begins with their forces.
         s.f[:] = 0
-        self._take(s)
+        take(s, self._forces)
         self.wait = 0 if found > GROWS * self.share else SELDOM - 1
         self.share = min(1.0, max(self.share, found)) or 1.0  # where nothing is free nothing is found
 
@@ -87,7 +87,7 @@ class Sharpness:
             scale = self._reach / size
             kernels.perturb(s.u, mode, scale, s.seen)
             trial.f[:] = 0
-            self._take(trial)
+            take(trial, self._forces)
             kernels.perturb(s.u, mode, -scale if s.seen is s.u else 0.0, s.seen)
             # The mode becomes mobility times its response, so that the response times it is mode . M mode.
             trial.f[self._held] = s.f[self._held]
@@ -104,7 +104,3 @@ class Sharpness:
 
     def _largest(self, value: float) -> float:
         return float(self._world.gather([value]).max())
-
-    def _take(self, trial: State) -> None:
-        for _, term in self._forces:
-            term(trial)

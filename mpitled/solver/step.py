@@ -204,6 +204,12 @@ def compose_relaxation(sub: Subdomain, counted: NDArray[np.bool_]) -> tuple[Term
     return (*((("reactions", reactions),) if len(m.dofs) else ()), ("update", relax))
 
 
+def take(s: State, terms: tuple[Term, ...]) -> None:
+    """Take the terms in their order. Collective if there is a halo among them."""
+    for _, term in terms:
+        term(s)
+
+
 def rehearse(s: State, terms: tuple[Term, ...]) -> None:
     """Take the terms once without other ranks, so that their kernels are compiled or loaded from the disk's cache."""
     for name, term in terms:
