@@ -199,7 +199,7 @@ class March:
             mobility = np.divide(s.time_step**2, required, out=np.zeros_like(required), where=required > 0)
         else:
             bound *= self._largest(self._needed(required))
-        self.sharpness.renew(s, mobility[None], bound, s.good)
+        self.sharpness.renew(s, mobility[None], bound)
         grown = self.sharpness.share / share
         required *= grown
         return math.sqrt(grown)

@@ -22,6 +22,7 @@ class Kept:
     """The attributes of an object that have to be known to go on from where it is."""
 
     nodes: tuple[str, ...] = ()  # arrays (..., n_nodes or more), float64, alike on all ranks with the node; or None
+    rough: tuple[str, ...] = ()  # the like, of which single precision is enough
     moving: tuple[str, ...] = ()  # arrays (n owned moving dofs,), float64
     sums: tuple[str, ...] = ()  # numbers of each rank, whose sum over the ranks counts
     least: tuple[str, ...] = ()  # numbers of each rank, of which the least counts
@@ -34,7 +35,7 @@ class Kept:
 
     @property
     def names(self) -> tuple[str, ...]:
-        return (*self.nodes, *self.moving, *self.sums, *self.least, *self.alike)
+        return (*self.nodes, *self.rough, *self.moving, *self.sums, *self.least, *self.alike)
 
 
 #: Objects by name, each with what is kept of it.
@@ -45,7 +46,11 @@ Memory = dict[str, Any]
 
 def remember(parts: Parts) -> Memory:
     """Copies of all that is kept of the parts."""
-    return {f"{name}.{a}": deepcopy(getattr(thing, a)) for name, thing, kept in parts for a in kept.names}
+    return {
+        f"{name}.{a}": getattr(thing, a).astype(np.float32) if a in kept.rough else deepcopy(getattr(thing, a))
+        for name, thing, kept in parts
+        for a in kept.names
+    }
 
 
 def recall(parts: Parts, memory: Mapping[str, Any]) -> None:
@@ -66,7 +71,7 @@ def recall(parts: Parts, memory: Mapping[str, Any]) -> None:
 class Packed:
     """A memory in the form of a file that any number of ranks can read."""
 
-    nodal: dict[str, NDArray[np.float64]]  # (n owned nodes, components); of all nodes of the rank when it is read
+    nodal: dict[str, NDArray[np.floating]]  # (n owned nodes, components); of all nodes of the rank when it is read
     own: dict[str, float]  # of each rank
     alike: dict[str, Any]
 
@@ -118,7 +123,7 @@ def unpack(parts: Parts, packed: Packed, table: Mapping[str, NDArray[np.float64]
 
 def _kinds(parts: Parts) -> Iterator[tuple[str, str]]:
     for name, _, kept in parts:
-        for kind in ("nodes", "moving", "sums", "least", "alike"):
+        for kind in ("nodes", "rough", "moving", "sums", "least", "alike"):
             for attribute in getattr(kept, kind):
                 yield f"{name}.{attribute}", kind
 

@@ -115,6 +115,8 @@ class Relaxation:
         """Find how sharp the bound of stiffness is. Collective."""
         take(self.state, self.forces)
         self._bound()
+        self.mass[:] = self.required
+        self._sharpen()
         self.state.f[:] = 0
 
     @property
@@ -208,17 +210,25 @@ class Relaxation:
                 self.required[diagonal] += self.survey.required[0]
         if self.halo is not None:
             self.halo.sum(self.required)
-        if self.sharpness.due() and (s.share < 1 or self.sharpness.share == 0):
-            # Where the looking goes on, the mobility that lasts is made of what is found.
-            kernels.invert_masses(self.required, self.free, s.mobility)
-            mode = np.empty(s.good.shape, s.good.dtype)  # for it is not known yet whether this state is good
-            self.sharpness.renew(s, s.mobility, (2 * self.safety) ** 2, mode)
-        self.required *= self.sharpness.share
+        self.required *= self.sharpness.share or 1.0
         return found
 
+    def _sharpen(self) -> None:
+        """Renew how sharp the bound is, of which `required` is this share."""
+        s, share = self.state, self.sharpness.share or 1.0
+        kernels.invert_masses(self.required, self.free, s.mobility)
+        self.sharpness.renew(s, s.mobility, (2 * self.safety) ** 2 / share)
+        self.mass *= self.sharpness.share / share
+        kernels.invert_masses(self.mass, self.free, s.mobility)
+
     def decide(self, figures: dict[str, float]) -> tuple[bool, bool]:
-        """Damping of the next steps; whether a frame is due now, and whether the static solution is reached."""
+        """Damping of the next steps; whether a frame is due now, and whether the static solution is reached.
+
+        Spoils `State.good`.
+        """
         s = self.state
+        if self.sharpness.due() and s.share < 1:
+            self._sharpen()
         known = figures["rayleigh_force"] / figures["rayleigh_mass"] if figures["rayleigh_mass"] > 0 else 0.0
         loaded, steady, before = s.share >= 1, False, self.distance
         if loaded:

@@ -55,25 +55,22 @@ class Sharpness:
         self.wait -= 1
         return self.wait < 0
 
-    def renew(self, s: State, mobility: NDArray[np.float64], bound: float, mode: NDArray[np.float32]) -> None:
-        """The share that the largest eigenvalue of `mobility` K has of its bound (alike), and when to ask again.
-
-        mode: as in `largest_eigenvalue`.
-        """
-        found = self.largest_eigenvalue(s, mobility, mode) / bound if bound > 0 else 0.0
+    def renew(self, s: State, mobility: NDArray[np.float64], bound: float) -> None:
+        """The share that the largest eigenvalue of `mobility` K has of its bound (alike), and when to ask again."""
+        found = self.largest_eigenvalue(s, mobility) / bound if bound > 0 else 0.0
         # Small displacements may have changed in their last bits: a run that is continued begins with their forces.
         s.f[:] = 0
         take(s, self._forces)
         self.wait = 0 if found > GROWS * self.share else SELDOM - 1
         self.share = min(1.0, max(self.share, found)) or 1.0  # where nothing is free nothing is found
 
-    def largest_eigenvalue(self, s: State, mobility: NDArray[np.float64], mode: NDArray[np.float32]) -> float:
+    def largest_eigenvalue(self, s: State, mobility: NDArray[np.float64]) -> float:
         """Largest eigenvalue (1/s^2 times the mobility's dt^2) of `mobility` K at the displacements of s, from below.
 
         s has the forces of its displacements, which may change in their last bits. mobility, s^2/kg: (1, n_nodes), or
-        symmetric tensors (6, n_nodes); 0 where it does not matter. mode (3, n_nodes): room for the trial displacements.
+        symmetric tensors (6, n_nodes); 0 where it does not matter. What is tried takes the room of `s.good`.
         """
-        rows, trial = self._sub.rows, copy(s)
+        rows, trial, mode = self._sub.rows, copy(s), s.good
         trial.f = np.empty_like(s.f)
         # The mode has less than the displacements' precision, for whatever it is, it is tried as it is.
         kernels.scramble(mode, rows.nodes)

@@ -29,7 +29,7 @@ class State:
         alike=("load_time", "time_step", "time", "step", "retain", "gain"),
     )
     #: Of a state that is gone on from at rest, with masses made anew.
-    KEPT_AT_REST: ClassVar = replace(KEPT.numbers, nodes=("u",))
+    KEPT_AT_REST: ClassVar = replace(KEPT.numbers, rough=("u",))
 
     u: NDArray[np.float64]  # (3, n_nodes + PADDING), m, at the time of `step`
     u_prev: NDArray[np.float64]  # (3, n_nodes + PADDING), m, one step before

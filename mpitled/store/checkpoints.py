@@ -44,7 +44,7 @@ def write_checkpoint(
     comm: Any,
     part: PartRows,
     told: Mapping[str, Any],
-    nodal: Mapping[str, NDArray[np.float64]],
+    nodal: Mapping[str, NDArray[np.floating]],
     own: Sequence[float],
 ) -> None:
     """Write a checkpoint, whole and on the disc before it takes the place of the last, which becomes the one before.
@@ -111,7 +111,9 @@ def checkpoint_contents(path: Path) -> dict[str, Any]:
     raise InputError(f"{path}: is damaged: {broken} is not what was written")
 
 
-def read_checkpoint(path: Path, nodes: NDArray[np.int64]) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64]]:
+def read_checkpoint(
+    path: Path, nodes: NDArray[np.int64]
+) -> tuple[dict[str, NDArray[np.floating]], NDArray[np.float64]]:
     """What a checkpoint holds of the nodes (ascending), (n nodes, components) by name; the numbers of each rank.
 
     Of a file that `checkpoint_contents` has read.
