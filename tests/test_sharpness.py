@@ -235,7 +235,7 @@ def test_the_iteration_leaves_the_forces_of_the_displacements(tmp_path, kind):
     for _, term in method.forces:
         term(s)
     before = s.u.copy()
-    method.sharpness.wait = 0
+    method.sharpness.next = 0
     method.decide(method.look())
     assert not np.array_equal(s.u, before)  # it was tried in place
     left = s.f.copy()

@@ -22,6 +22,8 @@ from mpitled.solver.survey import Survey
 #: Surveys of a run where what is stable changes fast, and where it does not; and the most steps from one to the next. A
 #: survey takes about the time of one step and a half.
 MANY, FEW, LONGEST_UNWATCHED = 100, 20, 100
+#: So often in a run is it looked for how sharp the bound is.
+SHARPENED = 20
 #: Where a step still stable has shrunk since the last survey by less than the first, the next ones come half as often;
 #: by more than the second, which `solver.safety` leaves room for, twice as often.
 CALM, HASTY = 1.03, 1.1
@@ -104,6 +106,7 @@ class March:
         self.interval = self.shortest_interval = shortest
         # Where a wave may run, one survey does not tell of the next.
         self.longest_interval = longest if self.solver.method == "quasi-static" else shortest
+        self.sharpness.seldom = int(self.end / self.longest / SHARPENED)
         s.time_step = self._fitting(self.longest, self.frame_span)
         s.mobility *= s.time_step**2  # from a step of 1 s
         if self.scales_mass:
@@ -214,14 +217,16 @@ class March:
         if s.time >= self.end - 0.5 * s.time_step:
             return due, True
         # Only now: it needs the room of the last good state, which this one is.
-        if self.sharpness.due():
+        if s.step >= self.sharpness.next:
             figures["step_ratio"] *= self._sharpen()
             if self.scales_mass:
                 self._raise_mass(self.survey.required[0])
         shrunk = figures["step_ratio"] / self.safety
         allowed = self.longest if self.scales_mass else min(self.longest, s.time_step / shrunk)
         longer = False
-        if shrunk > HASTY:
+        if s.step >= self.sharpness.next:  # still, for it has grown
+            self.interval = self.shortest_interval
+        elif shrunk > HASTY:
             self.interval = max(self.shortest_interval, self.interval // 2)
         elif longer := shrunk < CALM and self.interval < self.longest_interval:
             self.interval = min(self.longest_interval, 2 * self.interval)

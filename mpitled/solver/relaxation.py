@@ -20,6 +20,8 @@ from mpitled.solver.survey import Survey
 
 #: Steps between surveys.
 BETWEEN = 10
+#: Steps from one time that it is looked for how sharp the bound of stiffness is to the next.
+SHARPENED = 50
 #: A mass tensor's trace falls to no less than this share from one survey to the next.
 KEEP = 0.9
 #: The estimate has to hold for so many steps, and the lowest eigenvalue to change by less than this share in BETWEEN of
@@ -84,6 +86,7 @@ class Relaxation:
         self.best, self.best_lowest, self.waited = math.inf, 0.0, 0
         self.forces, self.motion = compose_forces(sub, force_halo), compose_relaxation(sub, self.counted)
         self.sharpness = Sharpness(sub, world, self.forces)
+        self.sharpness.seldom = SHARPENED
 
     @staticmethod
     def components(sub: Subdomain) -> int:
@@ -227,7 +230,7 @@ class Relaxation:
         Spoils `State.good`.
         """
         s = self.state
-        if self.sharpness.due() and s.share < 1:
+        if s.step >= self.sharpness.next and s.share < 1:
             self._sharpen()
         known = figures["rayleigh_force"] / figures["rayleigh_mass"] if figures["rayleigh_mass"] > 0 else 0.0
         loaded, steady, before = s.share >= 1, False, self.distance

@@ -25,21 +25,21 @@ from mpitled.solver.subdomain import Subdomain
 FIRST, AGAIN, CONVERGED = 60, 15, 1.01
 #: What is found is rounded up to a power of this, so that ranks summed in another order find the same.
 RUNG = 1.02
-#: Surveys from one power iteration to the next where nothing changes; where the share grew by more than GROWS, one.
-SELDOM, GROWS = 5, 1.05
+#: Where the share grew by more than this, it is looked for again at once.
+GROWS = 1.05
 
 
 class Sharpness:
     """Power iteration on K = df/du in the present configuration, on all ranks; all of its calls are collective."""
 
-    LASTING = Kept(alike=("share", "wait"))
+    LASTING = Kept(alike=("share", "seldom", "next"))
 
     def __init__(self, sub: Subdomain, world: World, forces: tuple[Term, ...]) -> None:
         self._sub, self._world, self._forces = sub, world, forces
         held = np.concatenate([sub.fixed, sub.moving])
         self._held = held % 3, held // 3
         self.share = 0.0  # of the bound, that the operator has had at most
-        self.wait = 0  # surveys until it is looked for again
+        self.seldom, self.next = 1, 0  # steps from one time that it is looked for to the next, and when that is
         spread = float(np.ptp(sub.rows.read("points"), axis=0).max()) if sub.n_nodes else 0.0
         # m, of the largest displacement that is tried: well above round-off, well below a cell.
         self._reach = float(np.finfo(sub.precision).eps) ** 0.5 * 0.02 * self._largest(spread)
@@ -47,21 +47,16 @@ class Sharpness:
     def asleep(self) -> Sharpness:
         """A copy that asks nothing of other ranks at the next survey."""
         twin = copy(self)
-        twin.share, twin.wait = 1.0, 1
+        twin.share = 1.0
         return twin
 
-    def due(self) -> bool:
-        """Whether it is time to renew the share; called once a survey."""
-        self.wait -= 1
-        return self.wait < 0
-
     def renew(self, s: State, mobility: NDArray[np.float64], bound: float) -> None:
-        """The share that the largest eigenvalue of `mobility` K has of its bound (alike), and when to ask again."""
+        """The share that the largest eigenvalue of `mobility` K has of its bound (alike), and when to look again."""
         found = self.largest_eigenvalue(s, mobility) / bound if bound > 0 else 0.0
         # Small displacements may have changed in their last bits: a run that is continued begins with their forces.
         s.f[:] = 0
         take(s, self._forces)
-        self.wait = 0 if found > GROWS * self.share else SELDOM - 1
+        self.next = s.step if found > GROWS * self.share else s.step + self.seldom
         self.share = min(1.0, max(self.share, found)) or 1.0  # where nothing is free nothing is found
 
     def largest_eigenvalue(self, s: State, mobility: NDArray[np.float64]) -> float:
