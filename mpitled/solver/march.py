@@ -22,8 +22,8 @@ from mpitled.solver.survey import Survey
 #: Surveys of a run where what is stable changes fast, and where it does not; and the most steps from one to the next. A
 #: survey takes about the time of one step and a half.
 MANY, FEW, LONGEST_UNWATCHED = 100, 20, 100
-#: So often in a run is it looked for how sharp the bound is.
-SHARPENED = 20
+#: So often in a run is it looked at how sharp the bound is, and every which time whole, though nothing seems changed.
+SHARPENED, WHOLE = 40, 6
 #: Where a step still stable has shrunk since the last survey by less than the first, the next ones come half as often;
 #: by more than the second, which `solver.safety` leaves room for, twice as often.
 CALM, HASTY = 1.03, 1.1
@@ -106,7 +106,8 @@ class March:
         self.interval = self.shortest_interval = shortest
         # Where a wave may run, one survey does not tell of the next.
         self.longest_interval = longest if self.solver.method == "quasi-static" else shortest
-        self.sharpness.seldom = int(self.end / self.longest / SHARPENED)
+        self.sharpness.seldom = self.sharpness.next = max(1, int(self.end / self.longest / SHARPENED))
+        self.sharpness.whole = WHOLE
         s.time_step = self._fitting(self.longest, self.frame_span)
         s.mobility *= s.time_step**2  # from a step of 1 s
         if self.scales_mass:
