@@ -13,6 +13,7 @@ from mpitled import cli
 from mpitled.errors import UnstableError
 from mpitled.solver.halo import World
 from mpitled.solver.run import Run
+from mpitled.store import ResultWriter
 
 BREAKS, AT = 2, 0.3  # the rank that does, and the share of the load at which
 
@@ -33,23 +34,27 @@ def inverted_cell(run: Run, node: int) -> None:
 
 
 def main(deck: str, directory: Path, way: str) -> None:
-    world, ends, watch = World(), {}, Run._look
+    world, ends, watch, go_on = World(), {}, Run._look, Run._ahead
 
-    def broken(run: Run) -> None:
+    def watched(run: Run) -> None:
         try:
             watch(run)
         except UnstableError:
             ends["detected"] = time.time()
             raise
+
+    def broken(run: Run, writer: ResultWriter) -> bool:
+        ahead = go_on(run, writer)  # with masses that are right, which it sees to
         if world.rank == BREAKS and run.method.state.share > AT and "broken" not in ends:
             ends["broken"] = time.time()
             lonely = np.ones(run.sub.n_nodes, bool)  # what no other rank has, and nothing prescribes
             for _, nodes in run.sub.shared:
                 lonely[nodes] = False
-            lonely[np.searchsorted(run.sub.rows.nodes, run.sub.rows.prescribed_dofs // 3)] = False
+            lonely[run.sub.rows.local(run.sub.rows.prescribed_dofs // 3)] = False
             globals()[way](run, int(np.flatnonzero(lonely)[0]))
+        return ahead
 
-    Run._look = broken  # type: ignore[method-assign]
+    Run._look, Run._ahead = watched, broken  # type: ignore[method-assign]
     try:
         cli.main(["run", "-q", deck, "--out", str(directory)])
     except SystemExit as end:
