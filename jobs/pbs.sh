@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # A scene on a PBS cluster. From the top of the repository, whose .venv was made with the modules named below:
-#   qsub -l select=8:ncpus=32:mpiprocs=32 -v DECK=jobs/brain_tumour.toml,SET=solver.load_time=4 jobs/pbs.sh
+#   qsub -l select=8:ncpus=32:mpiprocs=32 -v DECK=jobs/brain_tumour.toml,SET="solver.load_time=4 output.frames=5" jobs/pbs.sh
+# SET: keys with their values, blanks between them; a value with commas has to be in the deck, for qsub splits at them.
 #PBS -N mpitled
 #PBS -l select=4:ncpus=32:mpiprocs=32
 #PBS -l place=scatter:excl
@@ -13,7 +14,8 @@ cd "${PBS_O_WORKDIR:-.}"
 
 seconds=${RUN_SECONDS:-7080} # two minutes less than the walltime: the run keeps a checkpoint and ends; the same job goes on
 deck=$DECK
-set -- ${SET:+--set "$SET"}
+set --
+for key in ${SET:-}; do set -- "$@" --set "$key"; done
 out=${OUT:-out/$(basename "$deck" .toml)}
 ranks=2
 [ -z "${PBS_NODEFILE:-}" ] || ranks=$(wc -l <"$PBS_NODEFILE")

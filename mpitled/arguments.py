@@ -44,7 +44,7 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
     )
 
     sweep = command("sweep", "a table over values of keys, a run for each; goes on where it was stopped", json=True)
-    _deck(sweep, "the scene, or the folder of a sweep that goes on")
+    _deck(sweep, "the scene, or the folder of a sweep that goes on", "sweep_")
     varied = sweep.add_mutually_exclusive_group()
     varied.add_argument(
         "--vary",
@@ -101,7 +101,7 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
     )
 
     study = command("study", "error against run time over varied keys; goes on where it was stopped")
-    _deck(study)
+    _deck(study, prefix="study_")
     study.add_argument(
         "--vary",
         action="append",
@@ -153,9 +153,10 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
     return made
 
 
-def _deck(added: argparse.ArgumentParser, what: str = "the scene, a TOML file") -> None:
+def _deck(added: argparse.ArgumentParser, what: str = "the scene, a TOML file", prefix: str = "") -> None:
     added.add_argument("deck", type=Path, help=what)
-    added.add_argument("--out", type=Path, metavar="DIR", help="folder of the results (out/NAME OF THE DECK)")
+    help = f"folder of the results (out/{prefix}NAME OF THE DECK)"
+    added.add_argument("--out", type=Path, metavar="DIR", help=help)
     _set(added)
 
 

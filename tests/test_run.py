@@ -285,7 +285,7 @@ def test_a_step_above_the_critical_one_is_refused_with_the_one_to_use(tmp_path, 
     run = ("run", path, "--out", tmp_path / "out", "--set", "solver.mass_scaling=false", "--set")
     line = complaint(mpitled(*run, "solver.time_step=3e-3", n=n, status=2))
     assert "solver.time_step = 0.003" in line
-    longest = float(line.split("give at most ")[1].split(",")[0])
+    longest = float(line.split("give at most ")[1].split(" (s)")[0])
     mpitled(*run, f"solver.time_step={longest}", "--set", "solver.load_time=0.05", n=n)
 
 

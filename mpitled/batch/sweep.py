@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import re
 import secrets
 import shlex
 import shutil
@@ -230,9 +231,13 @@ def array_job(sweep: Sweep, scheduler: str) -> Path:
     """A script that computes each case as a task of an array job of SLURM or PBS; time and queue are the user's."""
     sweep.write_manifest()
     n, ranks, folder = len(sweep.cases), sweep.ranks, sweep.folder.resolve()
+    name = (
+        re.sub(r"[^A-Za-z0-9]", "_", sweep.folder.resolve().name)[:15].lstrip("_0123456789") or "sweep"
+    )  # as PBS takes it
     words = f"mpitled sweep {shlex.quote(str(folder))} --only"
     if scheduler == "slurm":
         head = [
+            f"#SBATCH --job-name={name}",
             f"#SBATCH --array=1-{n}",
             f"#SBATCH --ntasks={ranks}",
             "#SBATCH --cpus-per-task=1",
@@ -253,7 +258,8 @@ def array_job(sweep: Sweep, scheduler: str) -> Path:
             'exit "$status"',
         ]
     else:
-        head = [f"#PBS -l select=1:ncpus={ranks}:mpiprocs={ranks}", "#PBS -l walltime=01:00:00", f"#PBS -o {folder}"]
+        head = [f"#PBS -N {name}", "#PBS -j oe"]
+        head += [f"#PBS -l select=1:ncpus={ranks}:mpiprocs={ranks}", "#PBS -l walltime=01:00:00", f"#PBS -o {folder}"]
         head += [f"#PBS -J 1-{n}"] if n > 1 else []  # PBS refuses arrays of one
         body = [
             "# Two minutes less than the walltime, in seconds: PBS gives no notice.",

@@ -95,7 +95,12 @@ class March:
             if not self.scales_mass and self.longest > critical:
                 raise InputError(
                     f"solver.time_step = {self.longest:g}: is longer than the critical step of the undeformed model, "
-                    f"{critical:.3g} s; give at most {math.floor(critical * 1e8) / 1e8:g}, or leave it to auto"
+                    f"{critical:.3g} s; give at most {math.floor(critical * 1e8) / 1e8:g} (s), or leave it to auto"
+                )
+            if self.longest * FEW > self.end:
+                raise InputError(
+                    f"solver.time_step = {self.longest:g}: leaves {self.end / self.longest:.2g} steps for a run of "
+                    f"{self.end:g} s; give at most {self.end / FEW:g} (s), or leave it to auto"
                 )
         if self.end / self.longest > MOST_STEPS:
             raise InputError(

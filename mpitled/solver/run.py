@@ -482,6 +482,8 @@ class Run:
 def _remedy(deck: Deck) -> str:
     """What keeps such a scene stable."""
     slower = "more solver.load_steps" if deck.solver.method == "dynamic-relaxation" else "a longer solver.load_time"
+    if deck.solver.time_step != "auto":
+        slower = f"leave solver.time_step to auto, or {slower}"
     finer = "refine the mesh or the cloud there"
     if deck.tumour:
         return f"load more slowly ({slower}), {finer}, or enlarge tumour.seed_radius or cloud.radius"

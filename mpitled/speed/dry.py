@@ -232,9 +232,10 @@ def _forecast(run: Any, step: float, survey: float) -> list[str]:
         length = " of load"
         more = f"; then as many as come within {1e3 * method.tolerance:g} mm of rest, about as many again"
     expected = forecast.expect(method, step, survey, run.output_bytes)
+    least = "at least " if expected.at_least else ""
     return [
         f"steps: {expected.steps}{length}, {expected.surveys} surveys{more}",
-        f"loop: {expected.loop_s:.3g} s on the slowest rank ({1e3 * step:.3g} ms a step, "
+        f"loop: {least}{expected.loop_s:.3g} s on the slowest rank ({1e3 * step:.3g} ms a step, "
         f"{1e3 * survey:.3g} ms a survey: the fastest of {forecast.CALLS} calls on this machine)",
         f"output: {room.told(run.output_bytes)} in {run.deck.output.frames + 1} frames",
     ]

@@ -164,7 +164,7 @@ def kinetic_energy(u, u_prev, f, mobility, counted, held):  # type: ignore[no-un
     return 0.5 * twice
 
 
-@njit(cache=True)
+@njit(error_model="numpy", cache=True)
 def raise_mass(u, u_prev, mobility, required, counted, time_step):  # type: ignore[no-untyped-def]
     """Raise each node's mass to what is required; added mass (kg, times 3 directions not counted) and energy (J).
 
