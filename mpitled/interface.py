@@ -111,6 +111,10 @@ class RunResult:
     ) -> None:
         self.close()
 
+    def __repr__(self) -> str:
+        ended = "" if self.complete else ", unfinished"
+        return f"<RunResult {self.path}: {self._result.n_frames} frames{ended}>"
+
     def close(self) -> None:
         """Let go of the file."""
         self._result.__exit__()
@@ -150,8 +154,8 @@ class RunResult:
             raise InputError(f"{path}: cannot be read ({error}); make it: mpitled report {path.parent}") from None
 
     def to_pyvista(self, frame: int = -1) -> Any:
-        """A frame as pyvista.UnstructuredGrid, undeformed, in metres: hexahedra, and vertices for the rest."""
-        return views.grid(self._result, frame)
+        """A frame as pyvista.UnstructuredGrid, undeformed, in metres: see `views.grid`."""
+        return self._frames(lambda frame: views.grid(self._result, frame))[frame]
 
     def to_xarray(self) -> Any:
         """All frames as xarray.Dataset. InputError if they are more than a gigabyte."""

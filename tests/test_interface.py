@@ -86,6 +86,10 @@ def test_what_other_libraries_take(result):
             grid = opened.to_pyvista()
             assert grid.n_points == len(opened.points) + len(store.read_model(out / "model.h5").domains)
             assert np.nanmin(grid.cell_data["J"]) == opened.jacobian[-1].min()
+            assert np.array_equal(np.isnan(grid.cell_data["J"]), grid.cell_data["material"] < 0)
+            with pytest.raises(IndexError, match="and no 99"):
+                opened.to_pyvista(99)
+        assert repr(opened) == f"<RunResult {opened.path}: {len(opened.times)} frames>"
         if importlib.util.find_spec("pandas"):
             import pandas
 

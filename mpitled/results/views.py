@@ -117,16 +117,24 @@ def pyvista() -> Any:
 
 
 def grid(result: store.Result, frame: int) -> Any:
-    """A frame as pyvista.UnstructuredGrid, undeformed, in metres: hexahedra, and vertices for the rest."""
+    """A frame as pyvista.UnstructuredGrid, undeformed, in metres: hexahedra, and vertices for the rest.
+
+    At points: "displacement", the field's; in cells: "J", nan where there is no cell of the model but an EFG node, and
+    "material", the number of the deck's material there, or -1. InputError without PyVista.
+    """
     library, hexahedra = pyvista(), result.hexahedra
-    jacobian, numbers = result.cell_data("J", frame), result.point_data("node_id")
-    at_rows = np.full(len(numbers), np.nan)  # of integration points, which are the last cells, in the same order
-    at_rows[numbers < 0] = jacobian[len(jacobian) - np.count_nonzero(numbers < 0) :]
+    numbers = result.point_data("node_id")
     rest = np.setdiff1d(np.arange(len(numbers)), hexahedra)
     cells = {library.CellType.HEXAHEDRON: hexahedra, library.CellType.VERTEX: rest[:, None]}
     made = library.UnstructuredGrid({kind: nodes for kind, nodes in cells.items() if len(nodes)}, result.points)
     made.point_data["displacement"] = result.point_data("field_displacement", frame)
-    made.cell_data["J"] = np.concatenate([jacobian[: len(hexahedra)], at_rows[rest]])
+    for name, values, none in (
+        ("J", result.cell_data("J", frame), np.nan),
+        ("material", result.cell_data("material"), -1),
+    ):
+        at_rows = np.full(len(numbers), none, values.dtype)  # of integration points, which are the last cells, in order
+        at_rows[numbers < 0] = values[len(values) - np.count_nonzero(numbers < 0) :]
+        made.cell_data[name] = np.concatenate([values[: len(hexahedra)], at_rows[rest]])
     return made
 
 
