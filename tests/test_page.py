@@ -33,7 +33,7 @@ poissons_ratio = 0.49
 nodes = "bottom"
 [[displaced]]
 nodes = "top"
-displacement = [0.0, 0.0, -30.0]
+displacement = [0.0, 0.0, -45.0] # through itself
 [solver]
 method = "quasi-static"
 load_time = 0.02
