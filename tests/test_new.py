@@ -147,6 +147,34 @@ def test_a_tumour_that_no_cloud_is_known_to_take_is_warned_of(tmp_path):
             assert re.search(word, remark)
 
 
+def test_check_says_where_the_tumour_is_and_how_large(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(TUMOUR)
+    figures = overview.figures(path)["tumour"]
+    assert figures["centre_mm"] == pytest.approx([24, 20, 20])
+    assert figures["radius_mm"] == pytest.approx(5, rel=1e-4)
+    assert figures["distance_mm"] == {"surface": pytest.approx(20)}
+    assert figures["side"] == ""  # nobody knows which side of a block is left
+    line = "tumour           (24, 20, 20) mm; 523.6 mm3, radius 2 -> 5 mm; 20 mm from the surface"
+    assert line in overview.check(path).splitlines()
+
+
+def test_check_says_on_which_side_of_a_brain_the_tumour_is(tmp_path):
+    pytest.importorskip("nibabel")
+    path = tmp_path / "brain.toml"
+    scaffold.write("brain", path)
+    coarse = ["labels.element_size=8", "cloud.growth=0.4", "tumour.surface_nodes=300", "tumour.volume=2000"]
+    figures = overview.figures(path, coarse)["tumour"]
+    assert figures["side"] == "left"
+    apart = figures["distance_mm"]
+    assert apart["left_ventricle"] < apart["right_ventricle"]
+    assert 10 < apart["skull"] < 60
+    said = overview.check(path, coarse)
+    near = r"\d+(\.\d)? mm from the left ventricle, \d+(\.\d)? mm from the skull"
+    lies = re.escape("tumour           (-32, -20, 10) mm, left of the middle; 2000 mm3, radius 2 -> 7.82 mm; ")
+    assert re.search(f"^{lies}{near}$", said, re.MULTILINE)
+
+
 def test_a_tumour_in_the_wrong_place_is_said_with_the_deck(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_text(TUMOUR.replace("[24.0, 20.0, 20.0]", "[24.0, 20.0, 3.0]"))

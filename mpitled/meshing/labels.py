@@ -31,7 +31,8 @@ _SUFFIXES = (".nii", ".nii.gz", ".mgh", ".mgz")
 _VOXEL_BYTES, _CUBE_BYTES = 40, 60
 _INFLATED = 1032  # gzip makes no more of a byte than this
 _MOST_BEFORE = 1 << 24  # bytes of a NIfTI file before its voxels
-_VENTRICLES = ("left_ventricle", "right_ventricle")
+#: Parts of a head beside its tissue, left and right: keys of the deck, and cell and node sets.
+VENTRICLES = ("left_ventricle", "right_ventricle")
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,13 +133,13 @@ def mesh_labels(
 def label_cells(labels: deck.Labels) -> Head:
     """The cubes of tissue and ventricles of a label image; errors as `mesh_labels`."""
     image = read_image(Path(labels.image))
-    wanted = {name: getattr(labels, name) for name in ("tissue", *_VENTRICLES) if len(getattr(labels, name))}
+    wanted = {name: getattr(labels, name) for name in ("tissue", *VENTRICLES) if len(getattr(labels, name))}
     numbers = [number for several in wanted.values() for number in several]
     if twice := sorted({number for number in numbers if numbers.count(number) > 1}):
         raise InputError(f"{image.path}: label {twice[0]} is given twice in [labels]; a voxel is of one part only")
     voxels = {name: _voxels(image, name, several) for name, several in wanted.items()}
     body, remarks = _body(image, voxels)
-    voxels = {name: mask & body for name, mask in voxels.items() if name in _VENTRICLES}
+    voxels = {name: mask & body for name, mask in voxels.items() if name in VENTRICLES}
 
     size = labels.element_size
     n_cubes = float(body.sum() * (image.voxel / size).prod())
@@ -366,7 +367,7 @@ def _manifold(cells: Cells, share: NDArray[np.float64]) -> Cells:
 
 def _ventricles(image: Image, grid: Grid, shares: dict[str, NDArray[np.float64]], deep: Cells) -> dict[str, Cells]:
     """Cubes of each ventricle: one face-connected piece of the label's volume, off the outer surface."""
-    names = [name for name in _VENTRICLES if name in shares]
+    names = [name for name in VENTRICLES if name in shares]
     parts = {}
     for name in names:
         own = np.where(deep, shares[name], 0.0)
