@@ -14,7 +14,7 @@ from mpitled.loading import growth, sphere_radius, turn
 from mpitled.material import Material
 from mpitled.mesh import Mesh, Part, named_set
 from mpitled.meshing import block, checks, labels, phantoms
-from mpitled.meshing.cloud import in_sphere, length
+from mpitled.meshing.cloud import in_millimetres, in_sphere, length, looks_like_metres
 from mpitled.meshing.mapping import carry_over
 from mpitled.model import Model
 from mpitled.solver import hexahedra, support
@@ -156,9 +156,19 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
         remarks=(
             *mesh.remarks,
             *checks.scene_remarks(points, mesh.hexahedra, domains, n_fe_nodes, dofs),
+            *_place_remarks(deck, points),
             *(_growth_remarks(deck) if len(domains) else ()),
         ),
     )
+
+
+def _place_remarks(deck: Deck, points: NDArray[np.float64]) -> Iterator[str]:
+    """A warning of a tumour's place that is possible, but looks like a slip of the unit."""
+    if deck.tumour is None:
+        return
+    centre = np.asarray(deck.tumour.centre)
+    if said := looks_like_metres(centre, points.min(axis=0), points.max(axis=0)):
+        yield f"warning: tumour.centre = {in_millimetres(centre)}: {said}"
 
 
 def _growth_remarks(deck: Deck) -> Iterator[str]:

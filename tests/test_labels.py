@@ -335,6 +335,13 @@ def test_a_centre_in_voxels_is_told_in_millimetres(tmp_path):
     assert "voxels" not in str(error.value)
 
 
+def test_a_centre_in_metres_is_told_in_millimetres(tmp_path):
+    path = save(tmp_path / "p.nii", *phantom())
+    # (20, -5, 7) mm is tissue, and the place itself is too near to a ventricle.
+    with pytest.raises(InputError, match=r"; it looks like metres: in mm it is \(20, -5, 7\)$"):
+        mesh_labels(labels_of(path), deck.Cloud(), tumour((0.02e-3, -0.005e-3, 0.007e-3)))
+
+
 @pytest.mark.parametrize(
     ("keys", "message"),
     [

@@ -147,6 +147,20 @@ def test_a_tumour_that_no_cloud_is_known_to_take_is_warned_of(tmp_path):
             assert re.search(word, remark)
 
 
+def test_a_centre_that_looks_like_metres_is_said_so(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(TUMOUR.replace("[24.0, 20.0, 20.0]", "[0.024, 0.02, 0.02]"))
+    line = complaint(mpitled("check", path, status=2))
+    assert line.endswith("; it looks like metres: in mm it is (24, 20, 20)")
+    # Where it is possible, it is a warning.
+    path.write_text(TUMOUR)
+    keys = ["block.corner=[-24,-20,-20]", "tumour.centre=[-0.003,0.002,0.001]"]
+    (remark,) = overview.figures(path, keys)["remarks"]
+    said = "tumour.centre = (-0.003, 0.002, 0.001) mm: it looks like metres: in mm it is (-3, 2, 1)"
+    assert remark == f"warning: {said}"
+    assert overview.figures(path, ["block.corner=[-24,-20,-20]", "tumour.centre=[0,0,0]"])["remarks"] == []
+
+
 def test_check_says_where_the_tumour_is_and_how_large(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_text(TUMOUR)

@@ -17,7 +17,7 @@ from scipy import ndimage
 from mpitled import room
 from mpitled.errors import InputError
 from mpitled.mesh import CORNERS, Mesh, Part, check_size
-from mpitled.meshing.cloud import fill_void, in_millimetres, length
+from mpitled.meshing.cloud import fill_void, in_millimetres, length, looks_like_metres
 
 if TYPE_CHECKING:
     from mpitled import deck
@@ -418,17 +418,17 @@ def _void(head: Head, radius: float, centre: NDArray[np.float64]) -> Cells:
     """
     where = f"tumour.centre = {in_millimetres(centre)}"
     grid, parts = head.grid, head.parts
+    ends = (grid.origin, grid.origin + grid.size * np.array(grid.shape))
+    hint = f"; {said}" if (said := looks_like_metres(centre, *ends)) else ""
     cell = grid.cell_of(centre)
     part = next((name for name, cells in parts.items() if cell is not None and cells[cell]), None)
     if part != "tissue":
         lies = f"in the {part.replace('_', ' ')}" if part else "outside the brain"
         apart = _distance(grid, parts["tissue"], centre)
-        low, high = (1e3 * (grid.origin + grid.size * np.array(end)) for end in ((0, 0, 0), grid.shape))
-        extent = ", ".join(f"{name} {a:.0f} to {b:.0f}" for name, a, b in zip("xyz", low, high, strict=True))
+        extent = ", ".join(f"{name} {1e3 * a:.0f} to {1e3 * b:.0f}" for name, a, b in zip("xyz", *ends, strict=True))
         as_voxels = head.to_world @ np.append(1e3 * centre, 1.0)
         meant = grid.cell_of(as_voxels) if part is None else None
-        hint = ""
-        if meant is not None and head.solid[meant]:
+        if meant is not None and head.solid[meant] and not hint:
             hint = f"; it looks like voxels: in mm it is {in_millimetres(as_voxels).removesuffix(' mm')}"
         raise InputError(
             f"{where}: lies {lies}, {apart} from the nearest tissue; move it into tissue (the head: {extent} mm){hint}"
@@ -451,4 +451,4 @@ def _void(head: Head, radius: float, centre: NDArray[np.float64]) -> Cells:
         # One that must stay grows on the side away from the tumour until it is tied to the rest.
         beyond = square_distance > square_distance[held].mean()
         void &= ~(ndimage.binary_dilation(held) & beyond)
-    raise InputError(f"{where}: there is no room for a cloud so near to the skull or a ventricle; move it")
+    raise InputError(f"{where}: there is no room for a cloud so near to the skull or a ventricle; move it{hint}")
