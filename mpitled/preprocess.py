@@ -101,6 +101,7 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
     shapes, gradients, condition = support.moving_least_squares(points[domains], at, options.basis, options.weight)
     field_domains, field_shapes = support.field_at_nodes(points, n_fe_nodes, at, domains, options.basis, options.weight)
     dofs, displacements, turns = prescribe(deck, mesh)
+    _check_growth(deck, mesh, dofs, displacements)
 
     fe_gradients, fe_volumes = hexahedra.geometry(points, mesh.hexahedra, deck.hexahedra.gradient)
     figures = dict(mesh.figures)
@@ -160,6 +161,22 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
             *(_growth_remarks(deck) if len(domains) else ()),
         ),
     )
+
+
+def _check_growth(deck: Deck, mesh: Mesh, dofs: NDArray[np.int64], displacements: NDArray[np.float64]) -> None:
+    """InputError if the grown sphere reaches beyond nodes of the outer surface that are fixed: none can make room."""
+    if deck.tumour is None:
+        return
+    nodes, directions = np.unique(dofs[displacements == 0] // 3, return_counts=True)
+    outer = np.concatenate([_members(mesh, name) for name in OUTER])
+    fixed = np.setdiff1d(np.intersect1d(nodes[directions == 3], outer), _members(mesh, TUMOUR))
+    distances = np.linalg.norm(mesh.points[fixed] - np.asarray(deck.tumour.centre), axis=1)
+    radius, room = sphere_radius(deck.tumour.volume), float(distances.min(initial=np.inf))
+    if radius > room:
+        raise InputError(
+            f"{deck.path}: tumour.volume = {1e9 * deck.tumour.volume:g}: its sphere of {length(radius)} radius reaches "
+            f"beyond the outer surface, which is fixed {length(room)} from tumour.centre; lower it"
+        )
 
 
 def _place_remarks(deck: Deck, points: NDArray[np.float64]) -> Iterator[str]:

@@ -161,6 +161,18 @@ def test_a_centre_that_looks_like_metres_is_said_so(tmp_path):
     assert overview.figures(path, ["block.corner=[-24,-20,-20]", "tumour.centre=[0,0,0]"])["remarks"] == []
 
 
+def test_a_tumour_that_can_never_fit_is_refused(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(TUMOUR)
+    line = complaint(mpitled("check", path, "--set", "tumour.volume=3e6", status=2))
+    said = "tumour.volume = 3e+06: its sphere of 89.5 mm radius reaches beyond the outer surface, which is fixed 20 mm"
+    assert line == f"mpitled: {path}: {said} from tumour.centre; lower it"
+    # A surface that is free makes room.
+    path.write_text(TUMOUR.replace('nodes = "surface"', 'nodes = "x0"'))
+    keys = ["tumour.volume=40000", "tumour.centre=[28,20,20]"]  # 21.2 mm radius, 28 mm from what is fixed
+    assert any("beyond the cloud" in remark for remark in overview.figures(path, keys)["remarks"])
+
+
 def test_check_says_where_the_tumour_is_and_how_large(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_text(TUMOUR)
