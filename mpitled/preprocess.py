@@ -336,9 +336,11 @@ def _shared(
 def _materials(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int16], tuple[Material, ...]]:
     """Material of each cell, and the materials: those that the deck names first, then those of the mesh's own file.
 
-    "all" fills what no other set of the deck claims; what the deck leaves over is of the file's materials.
+    "all" fills what no other set of the deck claims; what the deck leaves over is of the file's materials. Ventricles
+    of which the deck says that there are none need no material, and may have one.
     """
-    claims = [(name, section.material) for section in deck.materials for name in section.cells]
+    absent = {name for name in labels.VENTRICLES if deck.labels and not getattr(deck.labels, name)}
+    claims = [(name, section.material) for section in deck.materials for name in section.cells if name not in absent]
     of_file = list(mesh.materials.items())
     if any(name == "all" for name, _ in claims):
         of_file = []

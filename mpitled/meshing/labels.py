@@ -274,7 +274,10 @@ def _voxels(image: Image, name: str, numbers: Sequence[int]) -> Cells:
     if missing:
         there = ", ".join(map(str, np.unique(image.labels[image.labels > 0])[:20]))
         what = f"label {', '.join(missing)} (labels.{name}) is not in it"
-        raise InputError(f"{image.path}: {what}; leave it out, or name one of {there}")
+        remedy = f"leave it out, or name one of {there}"
+        if len(missing) == len(numbers):  # without it a default would take effect
+            remedy = f"name one of {there}" + (f", or none: labels.{name} = []" if name in VENTRICLES else "")
+        raise InputError(f"{image.path}: {what}; {remedy}")
     return np.isin(image.labels, numbers)
 
 
