@@ -371,6 +371,22 @@ def test_a_brain_without_ventricles(tmp_path):
     assert set(mesh.node_sets) == {"skull"}
 
 
+def test_info_lists_the_labels_of_an_image(tmp_path):
+    data, affine = phantom((1.0, 1.5, 2.0))
+    path = save(tmp_path / "p.nii.gz", data, affine)
+    told = json.loads(mpitled("info", path, "--json").stdout)
+    assert told["voxels"] == [*data.shape]
+    assert told["voxel_mm"] == pytest.approx([1, 1.5, 2])
+    assert told["extent_mm"]["x"] == pytest.approx([3 - 36, 3 + 36])
+    counts = {str(label): 3e-3 * np.count_nonzero(data == label) for label in (5, 7, 41)}
+    assert told["labels_ml"] == pytest.approx(counts)
+    lines = mpitled("info", path).stdout.splitlines()
+    assert lines[2] == "voxel            1 x 1.5 x 2 mm"
+    assert f"label            41: {counts['41']:.3f} ml" in lines
+    assert f"list its labels by: mpitled info {path}" in complaint(mpitled("check", path, status=2))
+    assert "no such file" in complaint(mpitled("info", tmp_path / "q.nii", status=2))
+
+
 def test_a_brain_with_one_label_for_both_ventricles(tmp_path):
     """As the left one of a deck that says so, from check to report; a material may name the part that is not there."""
     data, affine = phantom()

@@ -172,7 +172,7 @@ def read_image(path: Path) -> Image:
         raise InputError(f"{path}: label images need nibabel; install it: pip install 'mpitled[images]'") from error
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; labels.image is a path from the deck's folder")
-    if not path.name.lower().endswith(_SUFFIXES):
+    if not is_image(path):
         raise InputError(
             f"{path}: is not an image of a kind that is read ({', '.join(_SUFFIXES)}); convert it to NIfTI"
         )
@@ -214,6 +214,28 @@ def read_image(path: Path) -> Image:
         voxel=edges * metre,
         to_world=to_world * metre,
     )
+
+
+def is_image(path: Path) -> bool:
+    """Whether a file is called as the images that are read."""
+    return path.name.lower().endswith(_SUFFIXES)
+
+
+def contents(path: Path) -> dict[str, Any]:
+    """Voxels of a label image along x, y, z, their edges (mm), its extent (mm), and the volume of each label (ml)."""
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; give an image of labels")
+    image = read_image(path)
+    n = np.array(image.labels.shape[::-1])
+    labels, counts = np.unique(image.labels[image.labels != 0], return_counts=True)
+    ends = 1e3 * np.stack([image.origin, image.origin + n * image.voxel], axis=1)
+    ml = 1e6 * float(image.voxel.prod())
+    return {
+        "voxels": n.tolist(),
+        "voxel_mm": (1e3 * image.voxel).tolist(),
+        "extent_mm": dict(zip("xyz", ends.tolist(), strict=True)),
+        "labels_ml": {str(label): ml * count for label, count in zip(labels.tolist(), counts.tolist(), strict=True)},
+    }
 
 
 def _check_start(path: Path) -> None:

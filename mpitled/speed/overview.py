@@ -15,9 +15,8 @@ from mpitled.deck import Deck, MeshFiles, Tumour, load_deck
 from mpitled.errors import InputError
 from mpitled.loading import sphere_radius
 from mpitled.mesh import Constraint, Mesh
-from mpitled.meshing import checks
+from mpitled.meshing import checks, labels
 from mpitled.meshing.cloud import in_millimetres, length
-from mpitled.meshing.labels import VENTRICLES
 from mpitled.readers import meshes
 from mpitled.readers.meshfile import MeshFile
 from mpitled.speed import forecast
@@ -56,6 +55,9 @@ def figures(path: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
 def _items(path: Path, overrides: Sequence[str]) -> Iterator[Item]:
     if path.suffix.lower() == ".toml":
         return _deck(load_deck(path, overrides))
+    if labels.is_image(path):
+        what = f'mpitled info {path}; a deck computes it by: [labels] image = "{path.name}"'
+        raise InputError(f"{path}: is an image; list its labels by: {what}")
     if overrides:
         raise InputError(f"{path}: is a mesh and has no keys to override; leave out --set")
     return _file(meshes.read_file(path))
@@ -100,7 +102,7 @@ def _tumour(tumour: Tumour, mesh: Mesh, *, x_is_right: bool) -> Item:
     """Where it lies, how large it grows, and how far its centre is from the nearest nodes of what is around it."""
     centre, radius = np.asarray(tumour.centre), sphere_radius(tumour.volume)
     around = {}
-    for name in VENTRICLES:
+    for name in labels.VENTRICLES:
         cells = mesh.cell_sets.get(name, np.empty(0, np.int64))
         around[name] = mesh.points[np.unique(mesh.hexahedra[cells[cells < len(mesh.hexahedra)]])]
     for name in preprocess.OUTER:
@@ -108,11 +110,11 @@ def _tumour(tumour: Tumour, mesh: Mesh, *, x_is_right: bool) -> Item:
         around[name] = mesh.points[outer.astype(np.int64)]
     around = {name: points for name, points in around.items() if len(points)}
     apart = {name: float(np.linalg.norm(points - centre, axis=1).min()) for name, points in around.items()}
-    ventricles = sorted((name for name in VENTRICLES if name in apart), key=apart.__getitem__)
+    ventricles = sorted((name for name in labels.VENTRICLES if name in apart), key=apart.__getitem__)
 
     across = float(centre[0] - (mesh.points[:, 0].min() + mesh.points[:, 0].max()) / 2)
     if len(ventricles) == 2:
-        left, right = (around[name][:, 0].mean() for name in VENTRICLES)
+        left, right = (around[name][:, 0].mean() for name in labels.VENTRICLES)
         across *= 1 if left < right else -1
     elif not x_is_right:  # nobody knows
         across = 0.0
