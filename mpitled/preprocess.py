@@ -25,6 +25,8 @@ TUMOUR = "tumour"
 OUTER = ("skull", "surface")
 #: Radius of a tumour over its seed's up to which clouds are known to complete, and a little (jobs/studies/README.md).
 GREATEST_GROWTH = 8.0
+#: Young's modulus of the tissue around a tumour below which it is more likely one in kPa or MPa, Pa.
+SOFTEST = 50.0
 
 
 def read_mesh(deck: Deck) -> Mesh:
@@ -157,7 +159,7 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
         remarks=(
             *mesh.remarks,
             *checks.scene_remarks(points, mesh.hexahedra, domains, n_fe_nodes, dofs),
-            *_place_remarks(deck, points),
+            *_slips(deck, mesh, material, materials),
             *(_growth_remarks(deck) if len(domains) else ()),
         ),
     )
@@ -179,13 +181,18 @@ def _check_growth(deck: Deck, mesh: Mesh, dofs: NDArray[np.int64], displacements
         )
 
 
-def _place_remarks(deck: Deck, points: NDArray[np.float64]) -> Iterator[str]:
-    """A warning of a tumour's place that is possible, but looks like a slip of the unit."""
+def _slips(deck: Deck, mesh: Mesh, material: NDArray[np.int16], materials: tuple[Material, ...]) -> Iterator[str]:
+    """Warnings of a tumour's place and tissue that are possible, but look like slips of the unit."""
     if deck.tumour is None:
         return
     centre = np.asarray(deck.tumour.centre)
-    if said := looks_like_metres(centre, points.min(axis=0), points.max(axis=0)):
+    if said := looks_like_metres(centre, mesh.points.min(axis=0), mesh.points.max(axis=0)):
         yield f"warning: tumour.centre = {in_millimetres(centre)}: {said}"
+    middles = np.concatenate([mesh.points[mesh.hexahedra].mean(axis=1), mesh.integration_points])
+    grows_in = materials[material[((middles - centre) ** 2).sum(axis=1).argmin()]]
+    if grows_in.youngs_modulus < SOFTEST:
+        what = f"material.{grows_in.name}.youngs_modulus = {grows_in.youngs_modulus:g}"
+        yield f"warning: {what}: is softer than any tissue that a tumour grows in; moduli are in Pa"
 
 
 def _growth_remarks(deck: Deck) -> Iterator[str]:

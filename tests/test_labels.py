@@ -371,6 +371,17 @@ def test_a_brain_without_ventricles(tmp_path):
     assert set(mesh.node_sets) == {"skull"}
 
 
+def test_ventricles_named_the_wrong_way_round_are_warned_of(tmp_path):
+    """By the image's own axes, whichever way its voxels run."""
+    path = tmp_path / "turned.nii"
+    nibabel.save(nibabel.Nifti1Image(*phantom()).as_reoriented(np.array([[0, -1], [1, 1], [2, 1]])), path)
+    assert mesh_labels(labels_of(path), deck.Cloud(), None).remarks == ()
+    swapped = labels_of(path, left_ventricle=(7,), right_ventricle=(5,))
+    (remark,) = mesh_labels(swapped, deck.Cloud(), None).remarks
+    said = "warning: labels.left_ventricle lies right of labels.right_ventricle in"
+    assert remark == f"{said} {path}; swap them"
+
+
 def test_info_lists_the_labels_of_an_image(tmp_path):
     data, affine = phantom((1.0, 1.5, 2.0))
     path = save(tmp_path / "p.nii.gz", data, affine)

@@ -10,7 +10,7 @@ import pytest
 from conftest import ROOT, complaint, mpitled
 from scenes import TUMOUR
 
-from mpitled import scaffold
+from mpitled import preprocess, scaffold
 from mpitled.arguments import KINDS
 from mpitled.deck import canonical, load_deck
 from mpitled.errors import InputError
@@ -159,6 +159,17 @@ def test_a_centre_that_looks_like_metres_is_said_so(tmp_path):
     said = "tumour.centre = (-0.003, 0.002, 0.001) mm: it looks like metres: in mm it is (-3, 2, 1)"
     assert remark == f"warning: {said}"
     assert overview.figures(path, ["block.corner=[-24,-20,-20]", "tumour.centre=[0,0,0]"])["remarks"] == []
+
+
+def test_a_tissue_too_soft_for_a_tumour_is_warned_of_by_runs_too(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(TUMOUR)
+    said = "warning: material.brain.youngs_modulus = 3: is softer than any tissue that a tumour grows in; moduli are in"
+    remarks = overview.figures(path, ["material.brain.youngs_modulus=3"])["remarks"]
+    assert remarks == [f"{said} Pa"]
+    assert remarks == list(preprocess.build(load_deck(path, ["material.brain.youngs_modulus=3"])).remarks)  # of a run
+    (remark,) = overview.figures(path, ["material.brain.youngs_modulus=0.003"])["remarks"]
+    assert "youngs_modulus = 0.003" in remark
 
 
 def test_a_tumour_that_can_never_fit_is_refused(tmp_path):

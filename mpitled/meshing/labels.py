@@ -139,6 +139,12 @@ def label_cells(labels: deck.Labels) -> Head:
         raise InputError(f"{image.path}: label {twice[0]} is given twice in [labels]; a voxel is of one part only")
     voxels = {name: _voxels(image, name, several) for name, several in wanted.items()}
     body, remarks = _body(image, voxels)
+    if all(name in voxels for name in VENTRICLES):
+        left, right = (np.nonzero(voxels[name])[2].mean() for name in VENTRICLES)
+        if left > right:
+            remarks.append(
+                f"warning: labels.left_ventricle lies right of labels.right_ventricle in {image.path}; swap them"
+            )
     voxels = {name: mask & body for name, mask in voxels.items() if name in VENTRICLES}
 
     size = labels.element_size

@@ -94,7 +94,8 @@ def _deck(deck: Deck) -> Iterator[Item]:
     yield Item("prescribed dofs", f"{n} of {of}", n)
     expected = forecast.forecast(deck, model)
     yield Item("run", expected.describe(), expected._asdict() | {"loop_s": expected.loop_s})
-    yield from _remarks(plausible(deck))
+    said = "".join(model.remarks)
+    yield from _remarks(text for text in plausible(deck) if text.partition(": is it")[0] not in said)
     yield from _remarks(model.remarks)
 
 
