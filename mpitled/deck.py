@@ -794,12 +794,29 @@ def recorded(table: Mapping[str, Any], path: Path) -> Deck:
 
 def difference(deck: Deck, earlier: dict[str, Any]) -> str:
     """The first key that matters to the result and differs from what was `canonical` without paths; "" if none does."""
-    now, then = (dict(_flat(table)) for table in (json.loads(json.dumps(canonical(deck, paths=False))), earlier))
-    for name in dict.fromkeys([*then, *now]):
-        if name not in _HARMLESS and now.get(name) != then.get(name):
-            before, after = (_show(of[name]) if name in of else "not there" for of in (then, now))
-            return f"{name} = {before}, and not {after}"
-    return ""
+    now = json.loads(json.dumps(canonical(deck, paths=False)))
+    first = next(differences(now, earlier), None)
+    if first is None:
+        return ""
+    name, *values = first
+    after, before = ("not there" if value is None else _show(value) for value in values)
+    return f"{name} = {before}, and not {after}"
+
+
+def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Keys that matter to the result and differ between two decks, as JSON has what is `canonical`, and both values.
+
+    A value that is not there is None.
+    """
+    first, second = dict(_flat(one)), dict(_flat(other))
+    for name in dict.fromkeys([*second, *first]):
+        if name not in _HARMLESS and first.get(name) != second.get(name):
+            yield name, first.get(name), second.get(name)
+
+
+def is_of_scene(name: str) -> bool:
+    """Whether a key says what is computed, and not how: geometry, tumour, materials and motion."""
+    return name.partition(".")[0] in (*GEOMETRIES, "tumour", "sphere", "material", "fixed", "displaced")
 
 
 _HARMLESS = ("title", "output.pictures", "output.checkpoint_minutes")
