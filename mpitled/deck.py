@@ -549,7 +549,10 @@ def _value(hint: Any, value: Any, about: _Key, name: str, source: _Source) -> An
         converted = _convert(hint, value, about.limits)
     except ValueError as error:
         default = "" if about.default in (MISSING, None) else f" (default {_show(about.default)})"
-        raise source.error(name, f"{error}; give {_expected(hint, about)}{default}", value) from None
+        remedy = f"give {_expected(hint, about)}{default}"
+        if get_origin(hint) is tuple and name in source.overridden and isinstance(value, str) and "," in value:
+            remedy += f", in brackets: '{name}=[{', '.join(part.strip() for part in value.split(','))}]'"
+        raise source.error(name, f"{error}; {remedy}", value) from None
     if isinstance(converted, Path):
         converted = source.path.parent / converted
         try:
