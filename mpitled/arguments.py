@@ -148,7 +148,10 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
 
     info = command("info", "versions of what mpitled works with, and what is missing; or of a file", json=True)
     info.add_argument(
-        "file", type=Path, nargs="?", help="model, result or checkpoint: what it holds, and whether it is whole"
+        "file",
+        type=Path,
+        nargs="?",
+        help="model, result, checkpoint or label image: what it holds, and whether it is whole",
     )
     return made
 

@@ -46,11 +46,12 @@ class _Key(NamedTuple):
     unit: str
     default: Any  # in the deck's unit; MISSING where the user must choose
     limits: str  # of each number, as an interval: "(0, 0.5]"
+    empty: bool  # whether a list may be
 
 
-def key(meaning: str, default: Any = MISSING, unit: str = "", limits: str = "") -> Any:
+def key(meaning: str, default: Any = MISSING, unit: str = "", limits: str = "", empty: bool = False) -> Any:
     """A field read from the deck in `unit` and kept in SI units; it must be given if it has no default."""
-    metadata = {"key": _Key(meaning, unit, default, limits)}
+    metadata = {"key": _Key(meaning, unit, default, limits, empty)}
     return field(metadata=metadata) if default is MISSING else field(default=_si(default, unit), metadata=metadata)
 
 
@@ -80,8 +81,8 @@ class Labels:
     image: Path = key("label image (NIfTI or MGH); relative to the deck's folder")
     element_size: float = key("edge of a hexahedron", 4.0, "mm", "(0, inf)")
     tissue: tuple[int, ...] = key("labels of brain tissue", (1,), limits="[1, inf)")
-    left_ventricle: tuple[int, ...] = key("labels of the left ventricle", (2,), limits="[1, inf)")
-    right_ventricle: tuple[int, ...] = key("labels of the right ventricle", (3,), limits="[1, inf)")
+    left_ventricle: tuple[int, ...] = key("labels of the left ventricle", (2,), limits="[1, inf)", empty=True)
+    right_ventricle: tuple[int, ...] = key("labels of the right ventricle", (3,), limits="[1, inf)", empty=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -542,11 +543,16 @@ def _unknown(written: str, valid: list[str], name: str) -> str:
 
 
 def _value(hint: Any, value: Any, about: _Key, name: str, source: _Source) -> Any:
+    if about.empty and value == []:
+        return ()
     try:
         converted = _convert(hint, value, about.limits)
     except ValueError as error:
         default = "" if about.default in (MISSING, None) else f" (default {_show(about.default)})"
-        raise source.error(name, f"{error}; give {_expected(hint, about)}{default}", value) from None
+        remedy = f"give {_expected(hint, about)}{default}"
+        if get_origin(hint) is tuple and name in source.overridden and isinstance(value, str) and "," in value:
+            remedy += f", in brackets: '{name}=[{', '.join(part.strip() for part in value.split(','))}]'"
+        raise source.error(name, f"{error}; {remedy}", value) from None
     if isinstance(converted, Path):
         converted = source.path.parent / converted
         try:
@@ -641,7 +647,8 @@ def _expected(hint: Any, about: _Key) -> str:
     """What to give for a key, in words: "3 numbers above 0, in mm"."""
     words = _type_words(hint)
     limits = " and ".join(words for _, words in _bounds(about.limits))
-    return words + (f" {limits}" if limits else "") + (f", in {about.unit}" if about.unit else "")
+    words += (f" {limits}" if limits else "") + (f", in {about.unit}" if about.unit else "")
+    return words + (", or [] for none" if about.empty else "")
 
 
 def _type_words(hint: Any) -> str:
@@ -707,7 +714,10 @@ def _check(deck: Deck, source: _Source) -> None:
         for name in ("tissue", "left_ventricle", "right_ventricle"):
             for label in getattr(deck.labels, name):
                 if label in named:
-                    what = f"label {label} is in labels.{named[label]} already; give each label one place"
+                    remedy = "give each label one place"
+                    if named[label] == "left_ventricle":
+                        remedy = "give it to labels.left_ventricle and leave labels.right_ventricle = []"
+                    what = f"label {label} is in labels.{named[label]} already; {remedy}"
                     raise source.error(f"labels.{name}", what, getattr(deck.labels, name))
                 named[label] = name
     if deck.tumour:
@@ -787,12 +797,29 @@ def recorded(table: Mapping[str, Any], path: Path) -> Deck:
 
 def difference(deck: Deck, earlier: dict[str, Any]) -> str:
     """The first key that matters to the result and differs from what was `canonical` without paths; "" if none does."""
-    now, then = (dict(_flat(table)) for table in (json.loads(json.dumps(canonical(deck, paths=False))), earlier))
-    for name in dict.fromkeys([*then, *now]):
-        if name not in _HARMLESS and now.get(name) != then.get(name):
-            before, after = (_show(of[name]) if name in of else "not there" for of in (then, now))
-            return f"{name} = {before}, and not {after}"
-    return ""
+    now = json.loads(json.dumps(canonical(deck, paths=False)))
+    first = next(differences(now, earlier), None)
+    if first is None:
+        return ""
+    name, *values = first
+    after, before = ("not there" if value is None else _show(value) for value in values)
+    return f"{name} = {before}, and not {after}"
+
+
+def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Keys that matter to the result and differ between two decks, as JSON has what is `canonical`, and both values.
+
+    A value that is not there is None.
+    """
+    first, second = dict(_flat(one)), dict(_flat(other))
+    for name in dict.fromkeys([*second, *first]):
+        if name not in _HARMLESS and first.get(name) != second.get(name):
+            yield name, first.get(name), second.get(name)
+
+
+def is_of_scene(name: str) -> bool:
+    """Whether a key says what is computed, and not how: geometry, tumour, materials and motion."""
+    return name.partition(".")[0] in (*GEOMETRIES, "tumour", "sphere", "material", "fixed", "displaced")
 
 
 _HARMLESS = ("title", "output.pictures", "output.checkpoint_minutes")

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from mpitled import __version__
 from mpitled.errors import InputError, damaged
 
+_MOST_LABELS = 200  # that are shown, a line each
 _SETUP = "bash jobs/brain.sh sets it up, or see jobs/environment.sh"
 
 
@@ -47,12 +48,16 @@ def versions() -> dict[str, str | None]:
 
 
 def contents(path: Path) -> dict[str, Any]:
-    """What a model, a result or a checkpoint is and holds, as JSON can hold it, after all of it was read.
+    """What a model, result, checkpoint or label image is and holds, as JSON can hold it, after all of it was read.
 
     InputError if it is none of these, or damaged.
     """
     if path.is_dir():
         raise InputError(f"{path}: is a folder; give a file in it, model.h5 or result.vtkhdf")
+    from mpitled.meshing import labels
+
+    if labels.is_image(path):
+        return {"kind": "image", "path": str(path), **labels.contents(path)}
     with damaged(path, "build the model anew, or run the deck again"):
         return _contents(path)
 
@@ -94,6 +99,20 @@ def describe(path: Path) -> str:
         from mpitled import store
 
         return f"{path}: a whole model of mpitled\n{store.describe_model(path)}"
+    if has["kind"] == "image":
+        volumes = has["labels_ml"].items()
+        lines = [
+            f"{path}: an image of {len(volumes)} labels",
+            f"voxels           {' x '.join(map(str, has['voxels']))}",
+            f"voxel            {' x '.join(f'{edge:.6g}' for edge in has['voxel_mm'])} mm",
+            "extent           "
+            + ", ".join(f"{axis} {low:.6g} to {high:.6g}" for axis, (low, high) in has["extent_mm"].items())
+            + " mm, to the right, front and top",
+            *(f"label            {label}: {ml:.3f} ml" for label, ml in list(volumes)[:_MOST_LABELS]),
+        ]
+        if len(volumes) > _MOST_LABELS:
+            lines.append(f"{len(volumes) - _MOST_LABELS} more; so many may be intensities, and no labels")
+        return "\n".join(lines)
     if has["kind"] == "checkpoint":
         lines = [
             f"{path}: a whole checkpoint of mpitled {has['version']}",

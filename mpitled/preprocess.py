@@ -14,7 +14,7 @@ from mpitled.loading import growth, sphere_radius, turn
 from mpitled.material import Material
 from mpitled.mesh import Mesh, Part, named_set
 from mpitled.meshing import block, checks, labels, phantoms
-from mpitled.meshing.cloud import in_sphere, length
+from mpitled.meshing.cloud import in_millimetres, in_sphere, length, looks_like_metres
 from mpitled.meshing.mapping import carry_over
 from mpitled.model import Model
 from mpitled.solver import hexahedra, support
@@ -25,6 +25,8 @@ TUMOUR = "tumour"
 OUTER = ("skull", "surface")
 #: Radius of a tumour over its seed's up to which clouds are known to complete, and a little (jobs/studies/README.md).
 GREATEST_GROWTH = 8.0
+#: Young's modulus of the tissue around a tumour below which it is more likely one in kPa or MPa, Pa.
+SOFTEST = 50.0
 
 
 def read_mesh(deck: Deck) -> Mesh:
@@ -101,6 +103,7 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
     shapes, gradients, condition = support.moving_least_squares(points[domains], at, options.basis, options.weight)
     field_domains, field_shapes = support.field_at_nodes(points, n_fe_nodes, at, domains, options.basis, options.weight)
     dofs, displacements, turns = prescribe(deck, mesh)
+    _check_growth(deck, mesh, dofs, displacements)
 
     fe_gradients, fe_volumes = hexahedra.geometry(points, mesh.hexahedra, deck.hexahedra.gradient)
     figures = dict(mesh.figures)
@@ -156,9 +159,40 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
         remarks=(
             *mesh.remarks,
             *checks.scene_remarks(points, mesh.hexahedra, domains, n_fe_nodes, dofs),
+            *_slips(deck, mesh, material, materials),
             *(_growth_remarks(deck) if len(domains) else ()),
         ),
     )
+
+
+def _check_growth(deck: Deck, mesh: Mesh, dofs: NDArray[np.int64], displacements: NDArray[np.float64]) -> None:
+    """InputError if the grown sphere reaches beyond nodes of the outer surface that are fixed: none can make room."""
+    if deck.tumour is None:
+        return
+    nodes, directions = np.unique(dofs[displacements == 0] // 3, return_counts=True)
+    outer = np.concatenate([_members(mesh, name) for name in OUTER])
+    fixed = np.setdiff1d(np.intersect1d(nodes[directions == 3], outer), _members(mesh, TUMOUR))
+    distances = np.linalg.norm(mesh.points[fixed] - np.asarray(deck.tumour.centre), axis=1)
+    radius, room = sphere_radius(deck.tumour.volume), float(distances.min(initial=np.inf))
+    if radius > room:
+        raise InputError(
+            f"{deck.path}: tumour.volume = {1e9 * deck.tumour.volume:g}: its sphere of {length(radius)} radius reaches "
+            f"beyond the outer surface, which is fixed {length(room)} from tumour.centre; lower it"
+        )
+
+
+def _slips(deck: Deck, mesh: Mesh, material: NDArray[np.int16], materials: tuple[Material, ...]) -> Iterator[str]:
+    """Warnings of a tumour's place and tissue that are possible, but look like slips of the unit."""
+    if deck.tumour is None:
+        return
+    centre = np.asarray(deck.tumour.centre)
+    if said := looks_like_metres(centre, mesh.points.min(axis=0), mesh.points.max(axis=0)):
+        yield f"warning: tumour.centre = {in_millimetres(centre)}: {said}"
+    middles = np.concatenate([mesh.points[mesh.hexahedra].mean(axis=1), mesh.integration_points])
+    grows_in = materials[material[((middles - centre) ** 2).sum(axis=1).argmin()]]
+    if grows_in.youngs_modulus < SOFTEST:
+        what = f"material.{grows_in.name}.youngs_modulus = {grows_in.youngs_modulus:g}"
+        yield f"warning: {what}: is softer than any tissue that a tumour grows in; moduli are in Pa"
 
 
 def _growth_remarks(deck: Deck) -> Iterator[str]:
@@ -309,9 +343,11 @@ def _shared(
 def _materials(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int16], tuple[Material, ...]]:
     """Material of each cell, and the materials: those that the deck names first, then those of the mesh's own file.
 
-    "all" fills what no other set of the deck claims; what the deck leaves over is of the file's materials.
+    "all" fills what no other set of the deck claims; what the deck leaves over is of the file's materials. Ventricles
+    of which the deck says that there are none need no material, and may have one.
     """
-    claims = [(name, section.material) for section in deck.materials for name in section.cells]
+    absent = {name for name in labels.VENTRICLES if deck.labels and not getattr(deck.labels, name)}
+    claims = [(name, section.material) for section in deck.materials for name in section.cells if name not in absent]
     of_file = list(mesh.materials.items())
     if any(name == "all" for name, _ in claims):
         of_file = []

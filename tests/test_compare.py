@@ -172,6 +172,15 @@ def test_another_result_is_a_reference(runs):
     assert groups["free"] == model.n_nodes - ends["bottom"] - ends["top"]
 
 
+def test_scenes_that_differ_are_said_to(runs, tmp_path):
+    assert compare.compare(runs["core"], runs["core"])["scene_differs_in"] == []
+    other = CYLINDER.format(cloud="none").replace("radius = 50", "radius = 45").replace("[0, 0, 20]", "[0, 0, 10]")
+    other = synthetic(tmp_path / "other", other)
+    said = "note: the scenes of both differ in cylinder.radius, displaced.0.displacement"
+    assert said in mpitled("compare", other, runs["none"]).stdout.splitlines()
+    assert "note" not in mpitled("compare", other, DATA / "A_ext.npz").stdout
+
+
 def test_table_and_vtk_files_are_references(runs, tmp_path):
     vtk = pytest.importorskip("vtk")
     from vtkmodules.util.numpy_support import numpy_to_vtk

@@ -329,6 +329,14 @@ def test_an_override_is_to_blame_for_what_is_in_it_or_around_it(folder, text, na
     assert complaint(path, "block.size.1=24.0").startswith(f"{path}: block.elements")
 
 
+def test_a_list_without_brackets_is_shown_with_them(folder):
+    message = complaint(write(folder, FULL), "tumour.centre=1,2, 3")
+    assert message.startswith(
+        '--set: tumour.centre = "1,2, 3": is a string, not a list; give a list of 3 numbers, in mm'
+    )
+    assert message.endswith("'tumour.centre=[1, 2, 3]'")
+
+
 def test_an_entry_of_a_list_can_be_overridden(folder):
     assert load_deck(write(folder, FULL), ["block.size.1=25"]).block.size == (0.03, 0.025, 0.024)
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import complaint, mpitled
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -335,6 +337,13 @@ def test_a_centre_in_voxels_is_told_in_millimetres(tmp_path):
     assert "voxels" not in str(error.value)
 
 
+def test_a_centre_in_metres_is_told_in_millimetres(tmp_path):
+    path = save(tmp_path / "p.nii", *phantom())
+    # (20, -5, 7) mm is tissue, and the place itself is too near to a ventricle.
+    with pytest.raises(InputError, match=r"; it looks like metres: in mm it is \(20, -5, 7\)$"):
+        mesh_labels(labels_of(path), deck.Cloud(), tumour((0.02e-3, -0.005e-3, 0.007e-3)))
+
+
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
@@ -343,6 +352,8 @@ def test_a_centre_in_voxels_is_told_in_millimetres(tmp_path):
         ({"size": 0.03}, "make it smaller"),
         ({"tissue": ()}, "labels.tissue names no label"),
         ({"right_ventricle": (41,)}, "given twice"),
+        ({"left_ventricle": (44,)}, r"in it; name one of 5, 7, 41, or none: labels.left_ventricle = \[\]$"),
+        ({"tissue": (44,)}, "in it; name one of 5, 7, 41$"),
         ({"left_ventricle": (5, 44)}, r"label 44 \(labels.left_ventricle\) is not in it; leave it out, .* 5, 7, 41$"),
     ],
 )
@@ -358,3 +369,79 @@ def test_a_brain_without_ventricles(tmp_path):
     mesh = mesh_labels(labels, deck.Cloud(), None)
     assert set(mesh.cell_sets) == {"all", "tissue"}
     assert set(mesh.node_sets) == {"skull"}
+
+
+def test_ventricles_named_the_wrong_way_round_are_warned_of(tmp_path):
+    """By the image's own axes, whichever way its voxels run."""
+    path = tmp_path / "turned.nii"
+    nibabel.save(nibabel.Nifti1Image(*phantom()).as_reoriented(np.array([[0, -1], [1, 1], [2, 1]])), path)
+    assert mesh_labels(labels_of(path), deck.Cloud(), None).remarks == ()
+    swapped = labels_of(path, left_ventricle=(7,), right_ventricle=(5,))
+    (remark,) = mesh_labels(swapped, deck.Cloud(), None).remarks
+    said = "warning: labels.left_ventricle lies right of labels.right_ventricle in"
+    assert remark == f"{said} {path}; swap them"
+
+
+def test_info_lists_the_labels_of_an_image(tmp_path):
+    data, affine = phantom((1.0, 1.5, 2.0))
+    path = save(tmp_path / "p.nii.gz", data, affine)
+    told = json.loads(mpitled("info", path, "--json").stdout)
+    assert told["voxels"] == [*data.shape]
+    assert told["voxel_mm"] == pytest.approx([1, 1.5, 2])
+    assert told["extent_mm"]["x"] == pytest.approx([3 - 36, 3 + 36])
+    counts = {str(label): 3e-3 * np.count_nonzero(data == label) for label in (5, 7, 41)}
+    assert told["labels_ml"] == pytest.approx(counts)
+    lines = mpitled("info", path).stdout.splitlines()
+    assert lines[2] == "voxel            1 x 1.5 x 2 mm"
+    assert f"label            41: {counts['41']:.3f} ml" in lines
+    assert f"list its labels by: mpitled info {path}" in complaint(mpitled("check", path, status=2))
+    assert "no such file" in complaint(mpitled("info", tmp_path / "q.nii", status=2))
+
+
+def test_a_brain_with_one_label_for_both_ventricles(tmp_path):
+    """As the left one of a deck that says so, from check to report; a material may name the part that is not there."""
+    data, affine = phantom()
+    save(tmp_path / "p.nii", np.where(data == 7, 5, data), affine)
+    text = """
+[labels]
+image = "p.nii"
+element_size = 4.0
+tissue = [41]
+left_ventricle = [5]
+right_ventricle = []
+[material.brain]
+youngs_modulus = 3000.0
+poissons_ratio = 0.45
+cells = ["tissue"]
+[material.csf]
+youngs_modulus = 10.0
+poissons_ratio = 0.1
+cells = ["left_ventricle", "right_ventricle"]
+[[fixed]]
+nodes = "skull"
+[tumour]
+centre = [3.0, 20.0, 7.0]
+volume = 110.0
+surface_nodes = 200
+[cloud]
+radius = 11.0
+growth = 0.4
+"""
+    path = tmp_path / "brain.toml"
+    path.write_text(text.replace("[]", "[5]"))
+    line = complaint(mpitled("check", path, status=2))
+    assert line.endswith("give it to labels.left_ventricle and leave labels.right_ventricle = []")
+    path.write_text(text)
+    assert "mm from the left ventricle" in mpitled("check", path).stdout
+    mpitled("run", path, "--out", tmp_path / "out")
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert set(report["ventricle_volume_change_ml"]) == {"left", "total"}
+    mpitled("sweep", path, "--vary", "tumour.volume=110", "--set", "output.pictures=false", "--out", tmp_path / "table")
+    (row,) = json.loads(mpitled("report", tmp_path / "table", "--json").stdout)
+    assert row["right_ml"] is None
+    assert row["left_ml"] == row["total_ml"]
+    # Without any, the fluid's material is of nothing.
+    path.write_text(
+        text.replace("tissue = [41]", "tissue = [5, 41]").replace("left_ventricle = [5]", "left_ventricle = []")
+    )
+    assert "csf" not in mpitled("check", path).stdout

@@ -10,7 +10,7 @@ import pytest
 from conftest import ROOT, complaint, mpitled
 from scenes import TUMOUR
 
-from mpitled import scaffold
+from mpitled import preprocess, scaffold
 from mpitled.arguments import KINDS
 from mpitled.deck import canonical, load_deck
 from mpitled.errors import InputError
@@ -145,6 +145,71 @@ def test_a_tumour_that_no_cloud_is_known_to_take_is_warned_of(tmp_path):
         assert len(remarks) == len(words)
         for remark, word in zip(remarks, words, strict=True):
             assert re.search(word, remark)
+
+
+def test_a_centre_that_looks_like_metres_is_said_so(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(TUMOUR.replace("[24.0, 20.0, 20.0]", "[0.024, 0.02, 0.02]"))
+    line = complaint(mpitled("check", path, status=2))
+    assert line.endswith("; it looks like metres: in mm it is (24, 20, 20)")
+    # Where it is possible, it is a warning.
+    path.write_text(TUMOUR)
+    keys = ["block.corner=[-24,-20,-20]", "tumour.centre=[-0.003,0.002,0.001]"]
+    (remark,) = overview.figures(path, keys)["remarks"]
+    said = "tumour.centre = (-0.003, 0.002, 0.001) mm: it looks like metres: in mm it is (-3, 2, 1)"
+    assert remark == f"warning: {said}"
+    assert overview.figures(path, ["block.corner=[-24,-20,-20]", "tumour.centre=[0,0,0]"])["remarks"] == []
+
+
+def test_a_tissue_too_soft_for_a_tumour_is_warned_of_by_runs_too(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(TUMOUR)
+    said = "warning: material.brain.youngs_modulus = 3: is softer than any tissue that a tumour grows in; moduli are in"
+    remarks = overview.figures(path, ["material.brain.youngs_modulus=3"])["remarks"]
+    assert remarks == [f"{said} Pa"]
+    assert remarks == list(preprocess.build(load_deck(path, ["material.brain.youngs_modulus=3"])).remarks)  # of a run
+    (remark,) = overview.figures(path, ["material.brain.youngs_modulus=0.003"])["remarks"]
+    assert "youngs_modulus = 0.003" in remark
+
+
+def test_a_tumour_that_can_never_fit_is_refused(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(TUMOUR)
+    line = complaint(mpitled("check", path, "--set", "tumour.volume=3e6", status=2))
+    said = "tumour.volume = 3e+06: its sphere of 89.5 mm radius reaches beyond the outer surface, which is fixed 20 mm"
+    assert line == f"mpitled: {path}: {said} from tumour.centre; lower it"
+    # A surface that is free makes room.
+    path.write_text(TUMOUR.replace('nodes = "surface"', 'nodes = "x0"'))
+    keys = ["tumour.volume=40000", "tumour.centre=[28,20,20]"]  # 21.2 mm radius, 28 mm from what is fixed
+    assert any("beyond the cloud" in remark for remark in overview.figures(path, keys)["remarks"])
+
+
+def test_check_says_where_the_tumour_is_and_how_large(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(TUMOUR)
+    figures = overview.figures(path)["tumour"]
+    assert figures["centre_mm"] == pytest.approx([24, 20, 20])
+    assert figures["radius_mm"] == pytest.approx(5, rel=1e-4)
+    assert figures["distance_mm"] == {"surface": pytest.approx(20)}
+    assert figures["side"] == ""  # nobody knows which side of a block is left
+    line = "tumour           (24, 20, 20) mm; 523.6 mm3, radius 2 -> 5 mm; 20 mm from the surface"
+    assert line in overview.check(path).splitlines()
+
+
+def test_check_says_on_which_side_of_a_brain_the_tumour_is(tmp_path):
+    pytest.importorskip("nibabel")
+    path = tmp_path / "brain.toml"
+    scaffold.write("brain", path)
+    coarse = ["labels.element_size=8", "cloud.growth=0.4", "tumour.surface_nodes=300", "tumour.volume=2000"]
+    figures = overview.figures(path, coarse)["tumour"]
+    assert figures["side"] == "left"
+    apart = figures["distance_mm"]
+    assert apart["left_ventricle"] < apart["right_ventricle"]
+    assert 10 < apart["skull"] < 60
+    said = overview.check(path, coarse)
+    near = r"\d+(\.\d)? mm from the left ventricle, \d+(\.\d)? mm from the skull"
+    lies = re.escape("tumour           (-32, -20, 10) mm, left of the middle; 2000 mm3, radius 2 -> 7.82 mm; ")
+    assert re.search(f"^{lies}{near}$", said, re.MULTILINE)
 
 
 def test_a_tumour_in_the_wrong_place_is_said_with_the_deck(tmp_path):

@@ -62,7 +62,10 @@ def test_a_sweep_killed_at_work_gives_the_table_that_groups_of_ranks_give(tmp_pa
     assert ["unstable" in row["failure"] for row in rows] == [False, False, True]
     assert float(rows[0]["min_jacobian"]) > 0
     assert rows[2]["min_jacobian"] == ""
-    assert "3/3 solver.load_steps=1: broken: unstable" in said
+    assert f"3 cases, 2 at a time; logs in {by_groups}/*/run.log" in said.splitlines()
+    ended = [line for line in said.splitlines() if line.startswith("[")]
+    assert {line[:13] for line in ended} >= {"[3 of 3 done]"}  # two groups that end at once both count both
+    assert sum("of 3 done] solver.load_steps=1: broken: unstable" in line for line in ended) == 1
 
     out = tmp_path / "killed"
     command = [str(Path(sys.executable).with_name("mpitled")), *map(str, WORDS), "--out", str(out)]
@@ -204,12 +207,12 @@ def test_a_screen_has_bars_on_a_terminal_alone(monkeypatch):
         monkeypatch.setattr(sys, "stderr", stream)
         shown = screen.Screen()
         shown.show({"a=1": 0.45, "a=2": 0.0}, 3)
-        shown.tell("1/5 a=1: done")
+        shown.tell("[1 of 5 done] a=1")
         said = stream.getvalue()
         assert ("\033[" in said) == terminal
         assert (" 45% |" in said) == terminal
-        assert "1/5 a=1: done" in said
-    assert said == "1/5 a=1: done\n"
+        assert "[1 of 5 done] a=1" in said
+    assert said == "[1 of 5 done] a=1\n"
 
 
 def test_what_cannot_be_swept_is_said_before_anything_runs(tmp_path):
@@ -334,12 +337,12 @@ def test_one_growth_passes_through_what_runs_of_their_own_find(tmp_path):
     mpitled("sweep", out)
     assert (out / "table.csv").read_bytes() == table
     broken = tmp_path / "broken"
-    too_much = ["--vary", "tumour.volume=150,20000,60000", "--one-growth", "--set", "solver.load_time=0.1"]
+    too_much = ["--vary", "tumour.volume=150,20000,33000", "--one-growth", "--set", "solver.load_time=0.1"]
     mpitled("sweep", deck, *too_much, "--out", broken, status=3)
     told = {row["tumour.volume"]: row["failure"] for row in open_sweep(broken)}
     assert told[150.0] == ""
     assert "unstable" in told[20000.0]
-    assert told[20000.0] == told[60000.0]
+    assert told[20000.0] == told[33000.0]
 
 
 def test_one_growth_is_for_slow_loading_to_volumes(tmp_path):

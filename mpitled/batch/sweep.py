@@ -9,6 +9,7 @@ import secrets
 import shlex
 import shutil
 import signal
+import sys
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -47,10 +48,20 @@ def compute(sweep: Sweep, world: World, *, jobs: int = 1, retry: bool = False, o
         todo.sort(key=lambda case: -case.work)
         first = {case.model: case for case in todo if case.shares and not _is_built(case, sweep.ranks)}
         models = [] if only else list(first.values())
+        if world.leads and todo:
+            _begin(sweep, cases, len(todo), world.size // sweep.ranks if world.size > 1 else jobs)
         if world.size > 1:
             _in_groups(sweep, models, todo, world, sweep.folder / f".claims-{token}")
         else:
             _as_processes(sweep, models, todo, jobs)
+
+
+def _begin(sweep: Sweep, cases: Sequence[Case], n_open: int, at_once: int) -> None:
+    """Say what is about to be computed, and where to look on."""
+    before = f", {len(cases) - n_open} of them done before" if n_open < len(cases) else ""
+    logs = sweep.folder / (cases[0].folder.name if len(cases) == 1 else "*") / launch.LOG
+    plan = f"{_count(len(cases), 'case')}{before}, {min(at_once, n_open)} at a time"
+    print(f"{plan}; logs in {logs}", file=sys.stderr, flush=True)
 
 
 def _to_do(cases: Sequence[Case], retry: bool) -> list[Case]:
@@ -151,8 +162,9 @@ def _prepare(case: Case) -> bool:
 
 def _end(sweep: Sweep, case: Case, failure: str, screen: Screen) -> None:
     launch.record(case.folder, failure, program=decks.program())
-    ended = f"{case.number}/{len(sweep.cases)} {case.words}: "
-    screen.tell(ended + (f"broken: {failure}" if failure else "done"), not failure)
+    done = sum(case.failure is not None for case in sweep.runs)  # of all groups
+    broken = f": broken: {failure}" if failure else ""
+    screen.tell(f"[{done} of {len(sweep.runs)} done] {case.words}{broken}", not failure)
 
 
 # --- in groups of ranks --------------------------------------------------------------------------------------------

@@ -124,7 +124,11 @@ def fill_void(
     boundary = boundary_faces(hexahedra[dropped])
     seed, spacing = _seed(cloud, tumour, element_size)
     if tumour is not None:
-        _check_room(points[boundary], tumour, element_size, cloud.radius)
+        try:
+            _check_room(points[boundary], tumour, element_size, cloud.radius)
+        except InputError as error:
+            hint = looks_like_metres(np.asarray(tumour.centre, float), points.min(axis=0), points.max(axis=0))
+            raise InputError(f"{error}; {hint}" if hint else str(error)) from None
 
     void = float(volumes_and_centroids(corners)[0].sum())
     _check_size(corners, void, spacing, cloud.points_per_spacing)
@@ -414,6 +418,14 @@ def _ball(radius: float) -> float:
 def in_millimetres(place: NDArray[np.float64]) -> str:
     """A place (3,), m, as the user wrote it in the deck."""
     return "(" + ", ".join(f"{1e3 * x:g}" for x in place) + ") mm"
+
+
+def looks_like_metres(place: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]) -> str:
+    """What to say of a place (3,), m, whose figures, taken as metres, would lie between low and high (3,), m; or ""."""
+    meant = 1e3 * place
+    if not 0 < np.abs(place).max() < 1e-3 or not ((low <= meant) & (meant <= high)).all():
+        return ""
+    return f"it looks like metres: in mm it is {in_millimetres(meant).removesuffix(' mm')}"
 
 
 def length(metres: float) -> str:

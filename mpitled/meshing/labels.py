@@ -17,7 +17,7 @@ from scipy import ndimage
 from mpitled import room
 from mpitled.errors import InputError
 from mpitled.mesh import CORNERS, Mesh, Part, check_size
-from mpitled.meshing.cloud import fill_void, in_millimetres, length
+from mpitled.meshing.cloud import fill_void, in_millimetres, length, looks_like_metres
 
 if TYPE_CHECKING:
     from mpitled import deck
@@ -31,7 +31,8 @@ _SUFFIXES = (".nii", ".nii.gz", ".mgh", ".mgz")
 _VOXEL_BYTES, _CUBE_BYTES = 40, 60
 _INFLATED = 1032  # gzip makes no more of a byte than this
 _MOST_BEFORE = 1 << 24  # bytes of a NIfTI file before its voxels
-_VENTRICLES = ("left_ventricle", "right_ventricle")
+#: Parts of a head beside its tissue, left and right: keys of the deck, and cell and node sets.
+VENTRICLES = ("left_ventricle", "right_ventricle")
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,13 +133,19 @@ def mesh_labels(
 def label_cells(labels: deck.Labels) -> Head:
     """The cubes of tissue and ventricles of a label image; errors as `mesh_labels`."""
     image = read_image(Path(labels.image))
-    wanted = {name: getattr(labels, name) for name in ("tissue", *_VENTRICLES) if len(getattr(labels, name))}
+    wanted = {name: getattr(labels, name) for name in ("tissue", *VENTRICLES) if len(getattr(labels, name))}
     numbers = [number for several in wanted.values() for number in several]
     if twice := sorted({number for number in numbers if numbers.count(number) > 1}):
         raise InputError(f"{image.path}: label {twice[0]} is given twice in [labels]; a voxel is of one part only")
     voxels = {name: _voxels(image, name, several) for name, several in wanted.items()}
     body, remarks = _body(image, voxels)
-    voxels = {name: mask & body for name, mask in voxels.items() if name in _VENTRICLES}
+    if all(name in voxels for name in VENTRICLES):
+        left, right = (np.nonzero(voxels[name])[2].mean() for name in VENTRICLES)
+        if left > right:
+            remarks.append(
+                f"warning: labels.left_ventricle lies right of labels.right_ventricle in {image.path}; swap them"
+            )
+    voxels = {name: mask & body for name, mask in voxels.items() if name in VENTRICLES}
 
     size = labels.element_size
     n_cubes = float(body.sum() * (image.voxel / size).prod())
@@ -171,7 +178,7 @@ def read_image(path: Path) -> Image:
         raise InputError(f"{path}: label images need nibabel; install it: pip install 'mpitled[images]'") from error
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; labels.image is a path from the deck's folder")
-    if not path.name.lower().endswith(_SUFFIXES):
+    if not is_image(path):
         raise InputError(
             f"{path}: is not an image of a kind that is read ({', '.join(_SUFFIXES)}); convert it to NIfTI"
         )
@@ -213,6 +220,28 @@ def read_image(path: Path) -> Image:
         voxel=edges * metre,
         to_world=to_world * metre,
     )
+
+
+def is_image(path: Path) -> bool:
+    """Whether a file is called as the images that are read."""
+    return path.name.lower().endswith(_SUFFIXES)
+
+
+def contents(path: Path) -> dict[str, Any]:
+    """Voxels of a label image along x, y, z, their edges (mm), its extent (mm), and the volume of each label (ml)."""
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; give an image of labels")
+    image = read_image(path)
+    n = np.array(image.labels.shape[::-1])
+    labels, counts = np.unique(image.labels[image.labels != 0], return_counts=True)
+    ends = 1e3 * np.stack([image.origin, image.origin + n * image.voxel], axis=1)
+    ml = 1e6 * float(image.voxel.prod())
+    return {
+        "voxels": n.tolist(),
+        "voxel_mm": (1e3 * image.voxel).tolist(),
+        "extent_mm": dict(zip("xyz", ends.tolist(), strict=True)),
+        "labels_ml": {str(label): ml * count for label, count in zip(labels.tolist(), counts.tolist(), strict=True)},
+    }
 
 
 def _check_start(path: Path) -> None:
@@ -273,7 +302,10 @@ def _voxels(image: Image, name: str, numbers: Sequence[int]) -> Cells:
     if missing:
         there = ", ".join(map(str, np.unique(image.labels[image.labels > 0])[:20]))
         what = f"label {', '.join(missing)} (labels.{name}) is not in it"
-        raise InputError(f"{image.path}: {what}; leave it out, or name one of {there}")
+        remedy = f"leave it out, or name one of {there}"
+        if len(missing) == len(numbers):  # without it a default would take effect
+            remedy = f"name one of {there}" + (f", or none: labels.{name} = []" if name in VENTRICLES else "")
+        raise InputError(f"{image.path}: {what}; {remedy}")
     return np.isin(image.labels, numbers)
 
 
@@ -366,7 +398,7 @@ def _manifold(cells: Cells, share: NDArray[np.float64]) -> Cells:
 
 def _ventricles(image: Image, grid: Grid, shares: dict[str, NDArray[np.float64]], deep: Cells) -> dict[str, Cells]:
     """Cubes of each ventricle: one face-connected piece of the label's volume, off the outer surface."""
-    names = [name for name in _VENTRICLES if name in shares]
+    names = [name for name in VENTRICLES if name in shares]
     parts = {}
     for name in names:
         own = np.where(deep, shares[name], 0.0)
@@ -417,17 +449,17 @@ def _void(head: Head, radius: float, centre: NDArray[np.float64]) -> Cells:
     """
     where = f"tumour.centre = {in_millimetres(centre)}"
     grid, parts = head.grid, head.parts
+    ends = (grid.origin, grid.origin + grid.size * np.array(grid.shape))
+    hint = f"; {said}" if (said := looks_like_metres(centre, *ends)) else ""
     cell = grid.cell_of(centre)
     part = next((name for name, cells in parts.items() if cell is not None and cells[cell]), None)
     if part != "tissue":
         lies = f"in the {part.replace('_', ' ')}" if part else "outside the brain"
         apart = _distance(grid, parts["tissue"], centre)
-        low, high = (1e3 * (grid.origin + grid.size * np.array(end)) for end in ((0, 0, 0), grid.shape))
-        extent = ", ".join(f"{name} {a:.0f} to {b:.0f}" for name, a, b in zip("xyz", low, high, strict=True))
+        extent = ", ".join(f"{name} {1e3 * a:.0f} to {1e3 * b:.0f}" for name, a, b in zip("xyz", *ends, strict=True))
         as_voxels = head.to_world @ np.append(1e3 * centre, 1.0)
         meant = grid.cell_of(as_voxels) if part is None else None
-        hint = ""
-        if meant is not None and head.solid[meant]:
+        if meant is not None and head.solid[meant] and not hint:
             hint = f"; it looks like voxels: in mm it is {in_millimetres(as_voxels).removesuffix(' mm')}"
         raise InputError(
             f"{where}: lies {lies}, {apart} from the nearest tissue; move it into tissue (the head: {extent} mm){hint}"
@@ -450,4 +482,4 @@ def _void(head: Head, radius: float, centre: NDArray[np.float64]) -> Cells:
         # One that must stay grows on the side away from the tumour until it is tied to the rest.
         beyond = square_distance > square_distance[held].mean()
         void &= ~(ndimage.binary_dilation(held) & beyond)
-    raise InputError(f"{where}: there is no room for a cloud so near to the skull or a ventricle; move it")
+    raise InputError(f"{where}: there is no room for a cloud so near to the skull or a ventricle; move it{hint}")

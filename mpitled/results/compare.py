@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mpitled import room, store
+from mpitled import deck, room, store
 from mpitled.errors import InputError, damaged
 from mpitled.model import Model
 from mpitled.preprocess import OUTER
@@ -29,6 +29,7 @@ TAGS = ("interior", "free surface", "fixed", "moved", "material interface")
 _PRESCRIBED = (2, 3)
 #: A reference for several tumours is used for a run whose radius is within this share of one of them.
 _SAME_RADIUS = 1e-3
+_SHOWN = 4  # keys in which two scenes differ that are named
 _SAMPLES = 32  # places on each edge, for distances from it
 
 
@@ -40,6 +41,7 @@ class Reference:
     displacement: NDArray[np.float64]  # (n, 3), m
     error: NDArray[np.float64] | None = None  # (n,), m: its own estimate, of the largest component
     tag: NDArray[np.int64] | None = None  # (n,), index into TAGS
+    deck: dict[str, Any] | None = None  # of a run of ours
 
 
 def compare(result: Path, reference: Path, beyond: float | None = None) -> dict[str, Any]:
@@ -64,6 +66,7 @@ def compare(result: Path, reference: Path, beyond: float | None = None) -> dict[
         "reference": str(reference),
         "load": ours.share,
         "complete": ours.complete,
+        "scene_differs_in": _differing(ours.metadata["deck"], theirs.deck),
         "beyond_mm": None if beyond is None else 1e3 * beyond,
         "largest_displacement_mm": _largest(theirs.displacement),
         "in_hexahedra": int(np.count_nonzero(values.source == field.IN_HEXAHEDRON)),
@@ -82,6 +85,9 @@ def table(figures: dict[str, Any]) -> str:
         f"outside (at most {figures['farthest_outside_mm']:.3f} mm); "
         f"largest displacement {figures['largest_displacement_mm']:.3f} mm",
     ]
+    if keys := figures["scene_differs_in"]:
+        more = f" and {len(keys) - _SHOWN} more" if len(keys) > _SHOWN else ""
+        lines.append(f"note: the scenes of both differ in {', '.join(keys[:_SHOWN])}{more}")
     if not figures["complete"]:
         lines.append(f"the run is not finished: the field is that at {figures['load']:.1%} of the load time")
     lines.append(
@@ -99,6 +105,16 @@ def table(figures: dict[str, Any]) -> str:
             + (f"{'-':>11}" if own is None else f"{own:11.4f}")
         )
     return "\n".join(lines)
+
+
+def _differing(ours: dict[str, Any], theirs: dict[str, Any] | None) -> list[str]:
+    """Keys of the scene that are not the same for both runs; none where the reference is no run."""
+    found = []
+    for name, *values in deck.differences(ours, theirs or ours):
+        moved = all(isinstance(value, str) for value in values) and len({Path(value).name for value in values}) == 1
+        if deck.is_of_scene(name) and not moved:  # a file may lie elsewhere, and be the same
+            found.append(name)
+    return found
 
 
 def _largest(displacement: NDArray[np.float64]) -> float:
@@ -184,7 +200,7 @@ def _of_result(path: Path) -> Reference:
         tag[theirs.model.node_sets.get(name, [])] = TAGS.index("free surface")
     tag[held] = TAGS.index("fixed")
     tag[moves] = TAGS.index("moved")
-    return Reference(theirs.model.points, theirs.at_nodes, None, tag)
+    return Reference(theirs.model.points, theirs.at_nodes, None, tag, theirs.metadata["deck"])
 
 
 def _of_npz(path: Path, ours: Field) -> Reference:

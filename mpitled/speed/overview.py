@@ -11,13 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled import preprocess
-from mpitled.deck import Deck, MeshFiles, load_deck
+from mpitled.deck import Deck, MeshFiles, Tumour, load_deck
 from mpitled.errors import InputError
-from mpitled.mesh import Constraint
-from mpitled.meshing import checks
+from mpitled.loading import sphere_radius
+from mpitled.mesh import Constraint, Mesh
+from mpitled.meshing import checks, labels
+from mpitled.meshing.cloud import in_millimetres, length
 from mpitled.readers import meshes
 from mpitled.readers.meshfile import MeshFile
 from mpitled.speed import forecast
+
+#: A tumour this near to the plane between left and right is in the middle, m.
+_MIDDLE = 0.5e-3
 
 
 class Item(NamedTuple):
@@ -50,6 +55,9 @@ def figures(path: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
 def _items(path: Path, overrides: Sequence[str]) -> Iterator[Item]:
     if path.suffix.lower() == ".toml":
         return _deck(load_deck(path, overrides))
+    if labels.is_image(path):
+        what = f'mpitled info {path}; a deck computes it by: [labels] image = "{path.name}"'
+        raise InputError(f"{path}: is an image; list its labels by: {what}")
     if overrides:
         raise InputError(f"{path}: is a mesh and has no keys to override; leave out --set")
     return _file(meshes.read_file(path))
@@ -81,12 +89,51 @@ def _deck(deck: Deck) -> Iterator[Item]:
     if deck.tumour:
         n = len(mesh.node_sets[preprocess.TUMOUR])
         yield Item("grows", f"tumour ({n} nodes)", {"tumour": n})
+        yield _tumour(deck.tumour, mesh, x_is_right=deck.labels is not None)
     n, of = len(model.prescribed_dofs), 3 * model.n_nodes
     yield Item("prescribed dofs", f"{n} of {of}", n)
     expected = forecast.forecast(deck, model)
     yield Item("run", expected.describe(), expected._asdict() | {"loop_s": expected.loop_s})
-    yield from _remarks(plausible(deck))
+    said = "".join(model.remarks)
+    yield from _remarks(text for text in plausible(deck) if text.partition(": is it")[0] not in said)
     yield from _remarks(model.remarks)
+
+
+def _tumour(tumour: Tumour, mesh: Mesh, *, x_is_right: bool) -> Item:
+    """Where it lies, how large it grows, and how far its centre is from the nearest nodes of what is around it."""
+    centre, radius = np.asarray(tumour.centre), sphere_radius(tumour.volume)
+    around = {}
+    for name in labels.VENTRICLES:
+        cells = mesh.cell_sets.get(name, np.empty(0, np.int64))
+        around[name] = mesh.points[np.unique(mesh.hexahedra[cells[cells < len(mesh.hexahedra)]])]
+    for name in preprocess.OUTER:
+        outer = np.setdiff1d(mesh.node_sets.get(name, ()), mesh.node_sets[preprocess.TUMOUR])
+        around[name] = mesh.points[outer.astype(np.int64)]
+    around = {name: points for name, points in around.items() if len(points)}
+    apart = {name: float(np.linalg.norm(points - centre, axis=1).min()) for name, points in around.items()}
+    ventricles = sorted((name for name in labels.VENTRICLES if name in apart), key=apart.__getitem__)
+
+    across = float(centre[0] - (mesh.points[:, 0].min() + mesh.points[:, 0].max()) / 2)
+    if len(ventricles) == 2:
+        left, right = (around[name][:, 0].mean() for name in labels.VENTRICLES)
+        across *= 1 if left < right else -1
+    elif not x_is_right:  # nobody knows
+        across = 0.0
+    side = "" if abs(across) < _MIDDLE else "right" if across > 0 else "left"
+    told = [*ventricles[:1], *(name for name in preprocess.OUTER if name in apart)]
+    text = f"{in_millimetres(centre)}{side and f', {side} of the middle'}"
+    text += f"; {1e9 * tumour.volume:g} mm3, radius {1e3 * tumour.seed_radius:g} -> {length(radius)}"
+    if told:
+        text += "; " + ", ".join(f"{length(apart[name])} from the {name.replace('_', ' ')}" for name in told)
+    figures = {
+        "centre_mm": (1e3 * centre).tolist(),
+        "side": side,
+        "volume_mm3": 1e9 * tumour.volume,
+        "seed_radius_mm": 1e3 * tumour.seed_radius,
+        "radius_mm": 1e3 * radius,
+        "distance_mm": {name: 1e3 * distance for name, distance in apart.items()},
+    }
+    return Item("tumour", text, figures)
 
 
 def plausible(deck: Deck) -> Iterator[str]:
