@@ -39,7 +39,9 @@ def read_mesh(deck: Deck) -> Mesh:
         raise InputError(f"{deck.path}: {error}") from None
     if not deck.spheres:
         return mesh
-    middles = np.concatenate([mesh.points[mesh.hexahedra].mean(axis=1), mesh.integration_points])
+    # Of a diagonal: corners of all would be the largest array of the building.
+    of_hexahedra = (mesh.points[mesh.hexahedra[:, 0]] + mesh.points[mesh.hexahedra[:, 6]]) / 2
+    middles = np.concatenate([of_hexahedra, mesh.integration_points])
     cell_sets = dict(mesh.cell_sets)
     apart = _bounding(deck)
     for sphere in deck.spheres:
@@ -188,7 +190,9 @@ def _slips(deck: Deck, mesh: Mesh, material: NDArray[np.int16], materials: tuple
     centre = np.asarray(deck.tumour.centre)
     if said := looks_like_metres(centre, mesh.points.min(axis=0), mesh.points.max(axis=0)):
         yield f"warning: tumour.centre = {in_millimetres(centre)}: {said}"
-    middles = np.concatenate([mesh.points[mesh.hexahedra].mean(axis=1), mesh.integration_points])
+    # Of a diagonal: corners of all would be the largest array of the building.
+    of_hexahedra = (mesh.points[mesh.hexahedra[:, 0]] + mesh.points[mesh.hexahedra[:, 6]]) / 2
+    middles = np.concatenate([of_hexahedra, mesh.integration_points])
     grows_in = materials[material[((middles - centre) ** 2).sum(axis=1).argmin()]]
     if grows_in.youngs_modulus < SOFTEST:
         what = f"material.{grows_in.name}.youngs_modulus = {grows_in.youngs_modulus:g}"
