@@ -272,7 +272,9 @@ def _history(run: _Run) -> Iterator[str]:
             lambda to: charts.draw_history(run.times, run.series, label, to),
             "Three charts over the run: energies, kinetic over internal energy in %, and the smallest J",
             f"At the {len(run.times)} frames that were written. J is the volume of a cell over its undeformed volume."
-            + " Masses are fictitious in relaxation, and so is kinetic energy." * run.relaxed,
+            + " Masses are fictitious in relaxation, and so is kinetic energy. They are made anew as the load grows, "
+            "which gives and takes energy: the balance counts it, and internal energy may be more than external work."
+            * run.relaxed,
         )
     series = run.series
     yield markup.hidden("The numbers, energies in J", _columns({label: run.times, **series}))

@@ -157,7 +157,7 @@ def _file(file: MeshFile) -> Iterator[Item]:
         kinds[kind] = kinds.get(kind, 0) + len(block.ids)
     for kind, n in kinds.items():
         yield Item("cells", f"{kind}: {n}", {kind: n})
-    yield _extent(file.points, 1.0, "")
+    yield _extent(file.points, 1.0, ", in the file's units")
     yield from _sets("node set", file.node_sets)
     yield from _sets("cell set", file.cell_sets)
     for name, material in file.materials:
