@@ -158,8 +158,8 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
 
 def _deck(added: argparse.ArgumentParser, what: str = "the scene, a TOML file", prefix: str = "") -> None:
     added.add_argument("deck", type=Path, help=what)
-    help = f"folder of the results (out/{prefix}NAME OF THE DECK)"
-    added.add_argument("--out", type=Path, metavar="DIR", help=help)
+    folder = f"out/{prefix}NAME OF THE DECK"
+    added.add_argument("--out", type=Path, metavar="DIR", help=f"folder of the results ({folder})")
     _set(added)
 
 

@@ -243,9 +243,7 @@ def array_job(sweep: Sweep, scheduler: str) -> Path:
     """A script that computes each case as a task of an array job of SLURM or PBS; time and queue are the user's."""
     sweep.write_manifest()
     n, ranks, folder = len(sweep.cases), sweep.ranks, sweep.folder.resolve()
-    name = (
-        re.sub(r"[^A-Za-z0-9]", "_", sweep.folder.resolve().name)[:15].lstrip("_0123456789") or "sweep"
-    )  # as PBS takes it
+    name = re.sub("[^A-Za-z0-9]", "_", folder.name)[:15].lstrip("_0123456789") or "sweep"  # as PBS takes it
     words = f"mpitled sweep {shlex.quote(str(folder))} --only"
     if scheduler == "slurm":
         head = [

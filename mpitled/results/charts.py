@@ -417,8 +417,5 @@ def _words(cell: dict[str, Any]) -> str:
     if cell["error_mm"] != "":
         return f"{float(cell['error_mm']):.2g}"
     reached = re.search(r"unstable at ([\d.]+%)", cell["message"])
-    return (
-        reached[1]
-        if reached
-        else {"3": "stalled", "2": "refused", "0": "error unsaid"}.get(str(cell["status"]), "no end")
-    )
+    ended = {"3": "stalled", "2": "refused", "0": "error unsaid"}
+    return reached[1] if reached else ended.get(str(cell["status"]), "no end")

@@ -66,7 +66,7 @@ class March:
         self.frame = 0
         self.state = at_rest(sub, solver.load_time, 1.0)
         self.survey = Survey(sub)
-        self.held = np.concatenate([sub.fixed, sub.moving])
+        self.held = sub.held
         nodes, directions = np.unique(self.held // 3, return_counts=True)
         self.prescribed: NDArray[np.int64] = nodes[directions == 3].astype(np.int64)  # need no mass for stability
         self.added_mass, self.added_energy = 0.0, 0.0
@@ -158,7 +158,7 @@ class March:
         """Call every kernel once, on the state at rest and to no effect, without other ranks."""
         twin = copy(self)
         # Its numbers are copies, its arrays are not: at millions of nodes they would be the largest that a run takes.
-        twin.state, twin.halo, twin.sharpness = copy(self.state), None, self.sharpness.asleep()
+        twin.state, twin.halo = copy(self.state), None
         rehearse(twin.state, (*self.forces, *self.motion))
         twin.look()
         self.state.rest()

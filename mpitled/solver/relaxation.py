@@ -155,7 +155,7 @@ class Relaxation:
         """Call every kernel once, on the state at rest and to no effect, without other ranks."""
         twin = copy(self)
         # Its numbers are copies, its arrays are not: at millions of nodes they would be the largest that a run takes.
-        twin.state, twin.halo, twin.sharpness = copy(self.state), None, self.sharpness.asleep()
+        twin.state, twin.halo = copy(self.state), None
         rehearse(twin.state, (*self.forces, *self.motion))
         twin.look()
         self.state.rest()

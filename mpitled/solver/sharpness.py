@@ -41,8 +41,7 @@ class Sharpness:
 
     def __init__(self, sub: Subdomain, world: World, forces: tuple[Term, ...]) -> None:
         self._sub, self._world, self._forces = sub, world, forces
-        held = np.concatenate([sub.fixed, sub.moving])
-        self._held = held % 3, held // 3
+        self._held = sub.held % 3, sub.held // 3
         self.share = 0.0  # of the bound, that the operator has had at most
         # Steps from one time that it is looked for to the next, and which time nothing is left out; set by the method.
         self.seldom, self.whole = 1, 1
@@ -53,12 +52,6 @@ class Sharpness:
         spread = float(np.ptp(sub.rows.read("points"), axis=0).max()) if sub.n_nodes else 0.0
         # m, of the largest displacement that is tried: well above round-off, well below a cell.
         self._reach = float(np.finfo(sub.precision).eps) ** 0.5 * 0.02 * self._largest(spread)
-
-    def asleep(self) -> Sharpness:
-        """A copy that asks nothing of other ranks at the next survey."""
-        twin = copy(self)
-        twin.share = 1.0
-        return twin
 
     def renew(self, s: State, mobility: NDArray[np.float64], bound: float) -> None:
         """The share that the largest eigenvalue of `mobility` K has of its bound (alike), and when to look again.

@@ -100,11 +100,15 @@ class Subdomain:
     shared: tuple[tuple[int, NDArray[np.uint32]], ...]  # (rank, nodes shared with it), ranks ascending
     precision: type[np.floating]  # of the cells' arithmetic
 
+    @property
+    def held(self) -> NDArray[np.uint32]:
+        """Prescribed dofs, fixed and moving."""
+        return np.concatenate([self.fixed, self.moving])
+
     def free(self) -> NDArray[np.bool_]:
         """(3, n_nodes): whether a dof is free, and not prescribed."""
         free = np.ones((3, self.n_nodes), bool)
-        for held in (self.fixed, self.moving):
-            free[held % 3, held // 3] = False
+        free[self.held % 3, self.held // 3] = False
         return free
 
     def steepest_load(self) -> float:
