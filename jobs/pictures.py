@@ -21,7 +21,9 @@ hexahedra = grid.celltypes == pyvista.CellType.HEXAHEDRON
 deformed = grid.warp_by_vector("displacement", factor=1e3 * factor)
 most = deformed.points[grid["moved (mm)"].argmax()]  # cut where it moves most
 colours = {"scalars": "moved (mm)", "cmap": "magma_r", "clim": (0, grid["moved (mm)"].max() or 1.0), "ambient": 0.4}
+colours["scalar_bar_args"] = {"vertical": True, "position_x": 0.88, "position_y": 0.25, "fmt": "%.1f"}
 
+pyvista.vtk_verbosity("off")  # no word of screens that are not there
 plotter = pyvista.Plotter(off_screen=True, window_size=(1200, 900))
 if hexahedra.any():
     half = deformed.extract_cells(hexahedra).clip("x", origin=most, crinkle=True)
@@ -30,5 +32,6 @@ cloud = deformed.extract_cells(~hexahedra)  # nodes of the mesh-free cloud, and 
 if cloud.n_cells:
     plotter.add_mesh(cloud.clip("x", origin=most), point_size=4, render_points_as_spheres=True, **colours)
 plotter.view_vector((1.0, 0.4, 0.3), viewup=(0.0, 0.0, 1.0))
+plotter.camera.zoom(1.4)
 plotter.add_axes()
 plotter.screenshot(picture)

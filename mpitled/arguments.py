@@ -35,7 +35,7 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
         "-v",
         "--verbose",
         action="store_true",
-        help="also each phase as it begins, with its rank; of --dry, every array",
+        help="also each phase as it begins, with its rank, and every figure at the end; of --dry, every array",
     )
     run.add_argument("-q", "--quiet", action="store_true", help="no progress and no table")
     run.add_argument("--resume", action="store_true", help="go on from the last checkpoint; from the start without one")
@@ -170,11 +170,14 @@ def _set(added: argparse.ArgumentParser) -> None:
     option.completer = _keys
 
 
-def _keys(prefix: str, **_: object) -> list[str]:
-    """For the shell's completion: keys of sections that are there once."""
+def _keys(prefix: str, **_others: object) -> list[str]:
+    """For the shell's completion: keys of sections that are there once, and after the = their values."""
     from mpitled.deck import keys
 
-    return [f"{key}=" for key in keys() if key.startswith(prefix)]
+    key, given, _ = prefix.partition("=")
+    if given:
+        return [f"{key}={value}" for value in keys().get(key, ())]
+    return [f"{name}=" for name in keys() if name.startswith(prefix)]
 
 
 def _model(added: argparse.ArgumentParser) -> None:

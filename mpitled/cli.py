@@ -10,6 +10,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -122,7 +123,7 @@ def _run(options: argparse.Namespace) -> None:
     if world.leads and (options.json or not options.quiet):
         from mpitled.results import report
 
-        _print(made, report.table, options)
+        _print(made, partial(report.table, whole=options.verbose), options)
         if not options.json:
             print(f"written to {_output(options)}; mpitled report {_output(options)} --html makes a page of it")
 

@@ -878,9 +878,22 @@ def _digest(path: Path) -> str:
     return f"sha256:{digest.hexdigest()}"
 
 
-def keys() -> list[str]:
-    """Every "section.key" of sections that are there once, whatever they are called."""
-    return [f"{home[1:-1]}.{about[0]}" for home, _, about in _declared() if about and re.fullmatch(r"\[\w+\]", home)]
+def keys() -> dict[str, list[str]]:
+    """Every "section.key" of sections that are there once, whatever they are called, and its values if they are few."""
+    return {
+        f"{home[1:-1]}.{about[0]}": _choices(about[1])
+        for home, _, about in _declared()
+        if about and re.fullmatch(r"\[\w+\]", home)
+    }
+
+
+def _choices(hint: Any) -> list[str]:
+    """Values as `--set` takes them."""
+    if hint is bool:
+        return ["true", "false"]
+    if get_origin(hint) in (Union, UnionType):
+        return [choice for of in get_args(hint) for choice in _choices(of)]
+    return [str(choice) for choice in get_args(hint)] if get_origin(hint) is Literal else []
 
 
 class Declared(NamedTuple):

@@ -99,7 +99,7 @@ class RunResult:
     """What a run wrote. Nothing is read before it is asked for; nodes and cells are in the model's order."""
 
     def __init__(self, result: store.Result) -> None:
-        self._result = result
+        self._open: store.Result | None = result
         self.path = result.path
         self.complete = result.complete  # whether the run came to its end
 
@@ -113,11 +113,19 @@ class RunResult:
 
     def __repr__(self) -> str:
         ended = "" if self.complete else ", unfinished"
-        return f"<RunResult {self.path}: {self._result.n_frames} frames{ended}>"
+        return f"<RunResult {self.path}: {f'{self._result.n_frames} frames' if self._open else 'closed'}{ended}>"
 
     def close(self) -> None:
         """Let go of the file."""
-        self._result.__exit__()
+        if self._open:
+            self._open.__exit__()
+        self._open = None
+
+    @property
+    def _result(self) -> store.Result:
+        if self._open is None:
+            raise InputError(f"{self.path}: is closed; read it before the end of `with`, or open it again")
+        return self._open
 
     @property
     def times(self) -> NDArray[np.float64]:

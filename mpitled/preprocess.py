@@ -184,7 +184,15 @@ def _check_growth(deck: Deck, mesh: Mesh, dofs: NDArray[np.int64], displacements
 
 
 def _slips(deck: Deck, mesh: Mesh, material: NDArray[np.int16], materials: tuple[Material, ...]) -> Iterator[str]:
-    """Warnings of a tumour's place and tissue that are possible, but look like slips of the unit."""
+    """Warnings of figures that are possible, but look like slips of the unit: of materials, and of a tumour."""
+    told = set()
+    for section in deck.materials:
+        name, modulus = f"material.{section.name}", section.youngs_modulus
+        if not 1 <= modulus <= 1e12:
+            told.add(section.name)
+            yield f"warning: {name}.youngs_modulus = {modulus:g}: is it in Pa? Brain tissue has about 3000"
+        if not 100 <= section.density <= 25000:
+            yield f"warning: {name}.density = {section.density:g}: is it in kg/m3? Tissue has about 1000"
     if deck.tumour is None:
         return
     centre = np.asarray(deck.tumour.centre)
@@ -194,7 +202,7 @@ def _slips(deck: Deck, mesh: Mesh, material: NDArray[np.int16], materials: tuple
     of_hexahedra = (mesh.points[mesh.hexahedra[:, 0]] + mesh.points[mesh.hexahedra[:, 6]]) / 2
     middles = np.concatenate([of_hexahedra, mesh.integration_points])
     grows_in = materials[material[((middles - centre) ** 2).sum(axis=1).argmin()]]
-    if grows_in.youngs_modulus < SOFTEST:
+    if grows_in.youngs_modulus < SOFTEST and grows_in.name not in told:
         what = f"material.{grows_in.name}.youngs_modulus = {grows_in.youngs_modulus:g}"
         yield f"warning: {what}: is softer than any tissue that a tumour grows in; moduli are in Pa"
 

@@ -69,6 +69,11 @@ def test_arrays_are_read_frame_by_frame_in_the_models_order(result):
         assert opened.history["min_jacobian"][-1] == report["min_jacobian"]
         with pytest.raises(IndexError, match="3 frames"):
             opened.displacement[3]
+        last = opened.displacement
+    for read in (lambda: opened.points, lambda: last[0]):
+        with pytest.raises(package.InputError, match="is closed"):
+            read()
+    assert repr(opened).endswith("closed>")
 
 
 def test_what_other_libraries_take(result):
@@ -113,7 +118,12 @@ def test_json_is_what_the_tables_say(result):
 
 def test_the_shell_completes_commands_and_keys(tmp_path):
     pytest.importorskip("argcomplete")
-    for line, word in (("mpitled sw", "sweep"), ("mpitled run --set solver.lo", "solver.load_steps=")):
+    for line, word in (
+        ("mpitled sw", "sweep"),
+        ("mpitled run --set solver.lo", "solver.load_steps="),
+        ("mpitled run --set solver.method=dyn", "dynamic-relaxation"),
+        ("mpitled run --set output.pictures=", "false"),
+    ):
         told = tmp_path / "told"
         shell = {
             "_ARGCOMPLETE": "1", "_ARGCOMPLETE_STDOUT_FILENAME": str(told), "_ARGCOMPLETE_SHELL": "bash",

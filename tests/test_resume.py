@@ -127,6 +127,22 @@ def test_another_run_is_refused(stopped, monkeypatch):
     assert go_on("title=renamed", "output.checkpoint_minutes=1")["complete"]
 
 
+def test_a_run_that_could_go_on_is_not_written_over(stopped, monkeypatch, capsys):
+    deck, folder = stopped
+    last, before = (folder / name for name in store.CHECKPOINTS)
+    with pytest.raises(InputError, match=r"checkpoint\.h5: holds this very run at [0-9.]+%; go on .* --resume, or rem"):
+        run(deck, folder, monkeypatch)
+    assert last.exists()
+    other = load_deck(deck, ["solver.load_time=0.1"])
+    assert job.run(other, folder, World())["complete"]
+    assert "note: the checkpoint of another run is discarded" in capsys.readouterr().err
+    assert not last.exists()
+    assert not before.exists()
+    assert run(deck, folder, monkeypatch)["resumed_at_step"] == 0
+    job.run(load_deck(deck), folder, World())
+    assert "note: the result of an earlier run is there" in capsys.readouterr().err
+
+
 def test_a_damaged_checkpoint_is_named_and_the_one_before_it_used(stopped, monkeypatch, capsys):
     deck, folder = stopped
     last, before = (folder / name for name in store.CHECKPOINTS)

@@ -284,12 +284,12 @@ def test_a_step_above_the_critical_one_is_refused_with_the_one_to_use(tmp_path, 
     path = deck(tmp_path, STRETCH, cloud="core", millimetres=3.0, load_time=1.0)
     run = ("run", path, "--out", tmp_path / "out", "--set", "solver.mass_scaling=false", "--set")
     line = complaint(mpitled(*run, "solver.time_step=3e-3", n=n, status=2))
-    assert "solver.time_step = 0.003" in line
+    assert f"{path}: solver.time_step = 0.003" in line
     longest = float(line.split("give at most ")[1].split(" (s)")[0])
     mpitled(*run, f"solver.time_step={longest}", "--set", "solver.load_time=0.05", n=n)
     # With more mass any step is stable, but of too few of them there is no ramp.
     few = complaint(mpitled("run", path, "--out", tmp_path / "out", "--set", "solver.time_step=0.3", n=n, status=2))
-    assert "solver.time_step = 0.3: leaves 3.3 steps for a run of 1 s; give at most 0.05 (s)" in few
+    assert f"{path}: solver.time_step = 0.3: leaves 3.3 steps for a run of 1 s; give at most 0.05 (s)" in few
 
 
 def test_a_density_in_the_wrong_unit_is_refused_for_the_steps_that_it_takes(tmp_path):

@@ -210,8 +210,8 @@ def _rendered(table: Table) -> tuple[list[str], list[list[str]]]:
             lines.append([*values, *([""] if who else []), str(row["failure"]), *[""] * (len(columns) - 1)])
         else:
             lines.append([*values, *who, *_cells(row | time, columns)])
-        if (their := table.beside.get(int(row["case"]))) is not None:
-            lines.append([*[""] * len(values), table.beside_name, *_cells(their, columns)])
+        if any(theirs := _cells(table.beside.get(int(row["case"]), {}), columns)):
+            lines.append([*[""] * len(values), table.beside_name, *theirs])
     return headings, lines
 
 
@@ -253,9 +253,10 @@ def _draw(table: Table, folder: Path) -> list[Path]:
                 families.setdefault(" ".join(f"{other}={row[other]}" for other in others), []).append(row)
         if table.beside:
             families[table.beside_name] = list(table.beside.values())
-        quantities = {c.name: c.heading for c in COLUMNS[:8] if any(row[c.name] != "" for row in rows)}
+        drawn = [column for column in COLUMNS[:-3] if any(row[column.name] != "" for row in rows)]
+        quantities, shares = {c.name: c.heading for c in drawn}, {c.name for c in drawn if "%" in c.form}
         label = f"{key}, {unit}" if (unit := unit_of(key)) else key
-        charts.draw_quantities(families, key, label, quantities, folder / "quantities.png")
+        charts.draw_quantities(families, key, label, quantities, shares, folder / "quantities.png")
         made.append(folder / "quantities.png")
     if timed := [row for row in rows if row["static_distance_mm"] != "" and row["loop_s"] != ""]:
         names = [_label(row, table.keys) + (" (warned)" if row[WARNINGS.name] else "") for row in timed]

@@ -88,7 +88,9 @@ class _Reader:
                 keyword.data.clear()  # the text is not needed any more
         self.keywords.clear()
         if self.skipped:
-            self.found.remarks.append(f"{self.found.path}: skipped {meshfile.listed(self.skipped, 40)}")
+            self.found.remarks.append(
+                f"{self.found.path}: skipped, for nothing here depends on it: {meshfile.listed(self.skipped, 40)}"
+            )
         return Model(self.found).file()
 
     def _take(self, keyword: Keyword) -> None:

@@ -246,7 +246,9 @@ class _Reader:
         if not any_keyword:
             raise InputError(f"{self.path}: is not an LS-DYNA deck; no line is a keyword such as *NODE")
         if self.skipped:
-            self.remarks.append(f"{self.path}: skipped {meshfile.listed(self.skipped, 40)}")
+            self.remarks.append(
+                f"{self.path}: skipped, for nothing here depends on it: {meshfile.listed(self.skipped, 40)}"
+            )
         return self._file()
 
     def _take(self, keyword: _Keyword) -> None:

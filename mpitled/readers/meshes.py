@@ -461,9 +461,8 @@ def assemble(section: deck.MeshFiles, fe: MeshFile, efg: MeshFile | None, seed_v
                 part.cells = np.concatenate([part.cells, at])
         own = cloud.efg_parents if cloud.efg_parents is not None else np.empty(0, np.int64)
         parts.append(_Part(efg, efg_points, efg_metre, efg_map, own, at[: len(own)]))
-        remarks.append(
-            f"{efg.path}: {len(interface)} nodes merged with FE nodes, {np.count_nonzero(new)} EFG nodes added"
-        )
+        known = f"{len(interface)} nodes merged with FE nodes, " if len(interface) else ""
+        remarks.append(f"{efg.path}: {known}{np.count_nonzero(new)} EFG nodes added")
     elif section.integration_points or section.dropped or section.surface_areas:
         raise InputError("mesh.efg: is missing; integration points and dropped hexahedra need the nodes of a cloud")
     if len(repeated := checks.coincident(points, section.merge_tolerance)):

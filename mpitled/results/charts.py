@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import LogLocator, PercentFormatter
 from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 
@@ -25,21 +26,17 @@ _To = Path | BinaryIO
 
 
 def _logarithmic(axes: Axes, x: str, y: str) -> None:
-    """Both axes, labelled so, logarithmic with plain numbers, and a grid.
+    """Both axes, labelled so, logarithmic, and a grid of which every line has its number.
 
-    Of the ticks between powers of ten only some have their number, the fewer the more powers there are.
+    The more powers of ten there are, the fewer lines there are between them.
     """
     axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
     axes.margins(0.12)
     for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
-        numbered = "12357" if high < 100 * low else "13"
-
-        def plain(value: float, _: Any, numbered: str = numbered) -> str:
-            text = f"{value:g}"
-            return text if text.strip("0.")[:1] in tuple(numbered) else ""
-
-        axis.set_major_formatter(plain)
-        axis.set_minor_formatter(plain)
+        between = [2.0, 3.0, 5.0, 7.0] if high < 100 * low else [3.0]
+        axis.set_minor_locator(LogLocator(subs=between, numticks=50))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter("{x:g}")
     axes.grid(True, which="both", linewidth=0.3)
 
 
@@ -203,11 +200,16 @@ def draw_prediction(rows: list[dict[str, Any]], subject: str, assumptions: str, 
 
 
 def draw_quantities(
-    families: Mapping[str, Sequence[Mapping[str, Any]]], key: str, label: str, quantities: Mapping[str, str], path: Path
+    families: Mapping[str, Sequence[Mapping[str, Any]]],
+    key: str,
+    label: str,
+    quantities: Mapping[str, str],
+    percentages: Container[str],
+    path: Path,
 ) -> None:
     """Each quantity (name: heading) of rows against their number under `key`, a line for each family of rows.
 
-    Rows that have "warnings" are ringed.
+    Shares among them, `percentages`, are drawn in %. Rows that have "warnings" are ringed.
     """
     across = min(4, math.ceil(len(quantities) ** 0.5) + 1)
     down = math.ceil(len(quantities) / across)
@@ -218,6 +220,8 @@ def draw_quantities(
         axes = figure.add_subplot(down, across, i)
         for j, (family, rows) in enumerate(families.items()):
             points = sorted((row[key], row[name]) for row in rows if row.get(name, "") != "")
+            if not points:
+                continue
             axes.plot(
                 [x for x, _ in points], [y for _, y in points], label=family or "here", linewidth=1, markersize=4,
                 color=_COLOURS[j % len(_COLOURS)], marker=_MARKERS[j % len(_MARKERS)],
@@ -229,10 +233,15 @@ def draw_quantities(
                 markersize=10, color=_INK, markerfacecolor="none",
             )  # fmt: skip
         axes.set(xlabel=label, ylabel=heading)
+        if name in percentages:
+            axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+            axes.set_ylim(bottom=0.0)
         axes.grid(True, linewidth=0.3)
-    handles, names = figure.axes[0].get_legend_handles_labels()
-    if len(handles) > 1:
-        figure.legend(handles, names, loc="outside lower center", ncols=min(4, len(handles)), fontsize=8)
+    shown = {
+        name: handle for axes in figure.axes for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    if len(shown) > 1:
+        figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=min(4, len(shown)), fontsize=8)
     figure.savefig(path, dpi=150)
 
 

@@ -54,7 +54,7 @@ figure { margin: 0 0 1.5rem; }
 figure img { display: block; max-width: 100%; height: auto; padding: 0.6rem; border: 1px solid var(--line); }
 figcaption { color: var(--faint); font-size: 0.92rem; margin-top: 0.4rem; max-width: 60rem; }
 details { margin: 0 0 1.2rem; }
-summary { cursor: pointer; color: var(--accent); }
+summary { cursor: pointer; color: var(--accent); margin-bottom: 0.4rem; }
 pre { overflow-x: auto; background: var(--ground); border: 1px solid var(--line); padding: 0.8rem; font-size: 0.85rem; }
 @media print { section { break-inside: avoid; } nav { display: none; } }"""
 
@@ -136,9 +136,14 @@ def listed(items: Iterable[str]) -> str:
     return f"<ul>{''.join(f'<li>{escape(item)}</li>' for item in items)}</ul>"
 
 
-def hidden(summary: str, lines: Iterable[str]) -> str:
-    """Plain lines that are shown when they are asked for."""
-    return f"<details><summary>{escape(summary)}</summary><pre>{escape(chr(10).join(lines))}</pre></details>"
+def plain(lines: Iterable[str]) -> str:
+    """Lines as they are, such as a file's."""
+    return f"<pre>{escape(chr(10).join(lines))}</pre>"
+
+
+def folded(summary: str, *parts: str) -> str:
+    """Parts that are shown when they are asked for."""
+    return f"<details><summary>{escape(summary)}</summary>{''.join(parts)}</details>"
 
 
 def _row(cells: Iterable[str]) -> str:

@@ -16,7 +16,7 @@ from mpitled import atomic, store, toml
 from mpitled.deck import GEOMETRIES, unit_of
 from mpitled.results import markup, report
 from mpitled.results.report import LARGE, Outcome
-from mpitled.results.solid import Solid, solid_of
+from mpitled.results.solid import Solid
 from mpitled.solver import hexahedra
 from mpitled.speed import dry
 
@@ -66,7 +66,7 @@ def _page(directory: Path, made: Mapping[str, Any]) -> str:
         draws = True
     except ImportError:
         draws = False
-    run = _Run(directory, outcome, made, times, series, solid_of(outcome.model, outcome.moved), draws)
+    run = _Run(directory, outcome, made, times, series, outcome.solid, draws)
     sections = (
         ("Scene", _scene(run)),
         ("Mesh", _mesh(run)),
@@ -103,7 +103,8 @@ def _head(run: _Run) -> Iterator[str]:
 
 def _cards(made: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield "largest displacement", f"{made['max_displacement_mm']:.2f} mm"
-    yield "of the volume moved more than 5 mm", f"{made['share_over_5mm']['volume']:.2%}"
+    if walls := made.get("max_displacement_of_ventricle_wall_mm"):
+        yield "largest displacement of a ventricle's wall", f"{max(walls.values()):.2f} mm"
     if change := made.get("ventricle_volume_change_ml"):
         yield "change of the ventricles", f"{change['total']:+.3f} ml"
     if volume := made.get("tumour_volume_mm3"):
@@ -146,7 +147,7 @@ def _scene(run: _Run) -> Iterator[str]:
         held.append((of["nodes"], ", ".join(of["directions"]), moved + turn))
     if held:
         yield markup.table(["nodes", "directions", "motion"], held, caption="Held and moved nodes")
-    yield markup.hidden("The deck: every value that took effect", toml.lines(deck))
+    yield markup.folded("The deck: every value that took effect", markup.plain(toml.lines(deck)))
 
 
 def _mesh(run: _Run) -> Iterator[str]:
@@ -212,6 +213,11 @@ def _displacement(run: _Run) -> Iterator[str]:
     rows += [(f"largest, wall of the {side} ventricle", f"{moved:.2f} mm") for side, moved in walls.items()]
     rows += [(f"moved more than 5 mm, share of {of}", f"{share:.2%}") for of, share in made["share_over_5mm"].items()]
     yield markup.table([], rows)
+    if model.n_nodes > model.n_fe_nodes:
+        yield markup.text(
+            "A cloud has most of its nodes beside the tumour: their share is of the mesh, the volume's of the tissue.",
+            "faint",
+        )
     if before := made.get("ventricle_volume_ml"):
         change = made["ventricle_volume_change_ml"]
         yield markup.table(
@@ -277,7 +283,7 @@ def _history(run: _Run) -> Iterator[str]:
             * run.relaxed,
         )
     series = run.series
-    yield markup.hidden("The numbers, energies in J", _columns({label: run.times, **series}))
+    yield markup.folded("The numbers, energies in J", markup.plain(_columns({label: run.times, **series})))
 
 
 def _columns(series: Mapping[str, NDArray[np.float64]]) -> Iterator[str]:
@@ -290,12 +296,14 @@ def _time(run: _Run) -> Iterator[str]:
     made = run.report
     yield markup.bars("Phases of the run", "s", list(made["seconds"].items()))
     if terms := made.get("term_seconds"):
-        yield markup.bars("Terms of the loop's steps, on rank 0", "s", list(terms.items()))
-    yield "<h3>What the steps do without</h3>"
+        yield markup.folded("Terms of the loop's steps", markup.bars("On rank 0", "s", list(terms.items())))
     ranks = run.outcome.metadata["ranks"]
     where = ", here on rank 0:" if ranks > 1 else ":"
-    yield markup.text(f"A term or an array that a scene does not need is not in its steps{where}")
-    yield markup.listed(dry.left_out(run.directory, run.outcome.metadata))
+    yield markup.folded(
+        "What the steps do without",
+        markup.text(f"A term or an array that a scene does not need is not in its steps{where}"),
+        markup.listed(dry.left_out(run.directory, run.outcome.metadata)),
+    )
 
 
 def _figures(run: _Run) -> Iterator[str]:

@@ -29,6 +29,7 @@ _STEEP = 0.8
 _INK = "#222222"
 _WALL: dict[str, Any] = {"color": "#0072b2", "linewidth": 1.6}
 _TUMOUR: dict[str, Any] = {"color": "#222222", "linewidth": 1.8}
+_INSIDE = "0.82"  # of the tumour
 _INTERFACE: dict[str, Any] = {"color": "#009e73", "linewidth": 1.2}
 #: Fills of materials in turn, of different lightness too, and the cloud's nodes.
 _MATERIALS = ("#f5e6d3", "#9ecae1", "#d9a6c4", "#7fa36b", "#8c8c8c")
@@ -68,7 +69,8 @@ def cuts(solid: Solid, centre: NDArray[np.float64] | None, title: str) -> Iterat
             bar.ax.axhline(level, color=_ink_on(norm(level)), linewidth=0.8)
         moved = f"{', '.join(f'{level:g}' for level in levels)} mm moved"
         _legend(figure, solid, [Line2D([], [], color=_INK, linewidth=0.8, label=moved)])
-        figure.suptitle(f"{title}: {name}")
+        # The same colours in both: where the tissue that moves so far was, and where it is then.
+        figure.suptitle(f"{title}: {name}, coloured by how far tissue {'moves' if share else 'will move'}")
         yield name, figure
 
 
@@ -143,17 +145,18 @@ def _in_three_planes(
             ylim=(low[up], high[up]),
             xlabel=f"{'xyz'[right]} (mm)",
             ylabel=f"{'xyz'[up]} (mm)",
-            title=f"{name + ', ' if solid.walls else ''}{'xyz'[normal]} = {at[normal]:g} mm",
+            title=f"{name + ', ' if solid.sides else ''}{'xyz'[normal]} = {at[normal]:g} mm",
         )
-        if right == 0:
-            sides(axes, solid)
+        if right in solid.sides:
+            name_sides(axes, solid.sides[right])
     return figure
 
 
 def _legend(figure: Figure, solid: Solid, shown: list[Any]) -> None:
     """What is shown, and below it the lines that are there."""
+    if len(solid.tumour):
+        shown.append(Patch(facecolor=_INSIDE, edgecolor=_TUMOUR["color"], linewidth=1.2, label="tumour"))
     for lines, style, label in (
-        (solid.tumour, _TUMOUR, "tumour"),
         (solid.walls, _WALL, "ventricle"),
         (solid.interface, _INTERFACE, "end of the support domains"),
     ):
@@ -237,13 +240,10 @@ def _outlines(
     if len(inside):
         around = inside - inside.mean(axis=0)
         outline = inside[np.argsort(np.arctan2(around[:, 1], around[:, 0]))]
-        axes.fill(*outline.T, color="0.82", zorder=2)
+        axes.fill(*outline.T, color=_INSIDE, zorder=2)
 
 
-def sides(axes: Any, solid: Solid) -> None:
-    """L and R where x runs to the right, of the body's own sides, from where the ventricles lie."""
-    if len(solid.walls) < 2:
-        return
-    left, right = (solid.points[solid.walls[f"{side}_ventricle"], 0].mean() for side in ("left", "right"))
-    for x, letter in ((0.04, "L" if left < right else "R"), (0.96, "R" if left < right else "L")):
+def name_sides(axes: Any, letters: tuple[str, str]) -> None:
+    """Letters of the body's sides at the left and the right of a picture."""
+    for x, letter in zip((0.04, 0.96), letters, strict=True):
         axes.text(x, 0.97, letter, transform=axes.transAxes, ha="center", va="top", fontsize=14, fontweight="bold")

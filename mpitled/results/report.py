@@ -21,6 +21,7 @@ from mpitled import atomic, store
 from mpitled.errors import InputError, damaged
 from mpitled.meshing.cloud import boundary_faces, interface_faces
 from mpitled.model import Model
+from mpitled.results.solid import Solid, solid_of
 from mpitled.solver import hexahedra
 
 REPORT, MODEL = "report.json", "model.h5"
@@ -71,6 +72,11 @@ class Outcome:
         moved = self.field.copy()
         moved[self.seed] = self.displacement[self.seed]
         return moved
+
+    @property
+    def solid(self) -> Solid:
+        """As it is drawn; made at each call."""
+        return solid_of(self.model, self.moved, anatomical="labels" in self.metadata.get("deck", {}))
 
 
 def write(directory: Path, seconds: Mapping[str, float] | None = None) -> dict[str, Any]:
@@ -197,12 +203,12 @@ def incomplete(report: Mapping[str, Any]) -> str:
     return f"not complete: {report['load_share']:.1%} of the load time{stopped}"
 
 
-def table(report: Mapping[str, Any]) -> str:
-    """The report for people to read; what is absent there is absent here."""
+def table(report: Mapping[str, Any], *, whole: bool = True) -> str:
+    """The report for people to read, or the few figures that decide what to do next; what is absent is absent here."""
     lines = [report["title"]] if report["title"] else []
     if not report["complete"]:
         lines.append(incomplete(report))
-    lines += [f"  {name:<47}  {value}" for name, value in rows(report)]
+    lines += [f"  {name:<47}  {value}" for name, value in rows(report, whole=whole)]
     lines += [f"  warning: {text}" for text in report["warnings"]]
     pictures = report["pictures"]
     lines.append(f"  {'pictures':<47}  {', '.join(pictures) if isinstance(pictures, list) else pictures}")
@@ -312,10 +318,9 @@ def _draw(outcome: Outcome, directory: Path) -> list[str] | str:
     except ImportError:
         return "none, for matplotlib is missing; install it: pip install 'mpitled[pictures]'"
     from mpitled.results import plot
-    from mpitled.results.solid import solid_of
 
     try:
-        return plot.draw(directory, solid_of(outcome.model, outcome.moved), outcome.centre, outcome.title)
+        return plot.draw(directory, outcome.solid, outcome.centre, outcome.title)
     except OSError as error:
         raise InputError(f"{directory}: pictures cannot be written ({error.strerror})") from None
 
@@ -331,7 +336,8 @@ def _without_nan(value: Any) -> Any:
 
 # --- the table -----------------------------------------------------------------------------------------------------
 
-#: Key, name and format of each line of the table; parts of a key are listed as they are.
+#: Key, name and format of each line of the table; parts of a key are listed as they are. With `_HEADLINES`, which are
+#: what was asked for and how far it can be trusted, a run ends; the others are for who looks closer.
 _LINES = (
     ("max_displacement_mm", "largest displacement", "{:.2f} mm"),
     ("max_displacement_outside_first_ring_mm", "outside the tumour's first ring of cells", "{:.2f} mm"),
@@ -364,18 +370,25 @@ _LINES = (
     ("cell_updates_per_second", "cell updates a second", "{:.3g}"),
     ("halo_share", "halo's share of the loop, worst rank", "{:.1%}"),
     ("imbalance", "imbalance of computing", "{:.1%}"),
-    ("seconds", "wall time", "{:.1f} s"),
+    ("run_s", "run time", "{:.1f} s"),
+    ("seconds", "run time, by phase", "{:.1f} s"),
 )
+_HEADLINES = {
+    "max_displacement_mm", "max_displacement_of_ventricle_wall_mm", "ventricle_volume_change_ml", "tumour_volume_mm3",
+    "volume_balance.relative_error", "cloud_misfit_mm", "static_distance_mm", "min_jacobian", "steps", "run_s",
+}  # fmt: skip
 #: Lines of relaxation alone, and those that mean nothing there, where masses and time are fictitious.
 _OF_RELAXATION = {"energy_J.dissipated"}
 _OF_MARCHES = {"energy_J.added_mass", "kinetic_to_internal.largest_after_10_percent", "time_step_s"}
 
 
-def rows(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Name and value of each line of the table."""
+def rows(report: Mapping[str, Any], *, whole: bool = True) -> Iterator[tuple[str, str]]:
+    """Name and value of each line of the table, or of its headlines."""
+    if "loop" in report["seconds"]:  # of a run that was killed nothing is known but how long its report took
+        report = dict(report) | {"run_s": sum(report["seconds"].values())}
     foreign = _OF_MARCHES if report.get("method") == "dynamic-relaxation" else _OF_RELAXATION
     for key, name, form in _LINES:
-        if key in foreign:
+        if key in foreign or not (whole or key in _HEADLINES):
             continue
         value: Any = report
         for part in key.split("."):
@@ -385,5 +398,5 @@ def rows(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
             yield name, ", ".join(parts)
         elif value is not None:
             yield name, form.format(value)
-    if "peak_memory_bytes" in report:
+    if whole and "peak_memory_bytes" in report:
         yield "peak memory of each rank", ", ".join(f"{b / 2**20:.0f} MiB" for b in report["peak_memory_bytes"])

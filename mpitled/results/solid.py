@@ -32,12 +32,16 @@ class Solid:
     cloud: NDArray[np.int64]  # (k, 4), tetrahedra
     interface: NDArray[np.int64]  # (k, 3), triangles between hexahedra and cloud
     walls: dict[str, NDArray[np.int64]]  # ventricle -> triangles (k, 3) around it
+    sides: dict[int, tuple[str, str]]  # axis -> letters of the body's sides at its low and its high end, where known
     tumour: NDArray[np.int64]  # (k, 3), triangles around it
     surface: NDArray[np.int64]  # (k, 3), triangles of the body's outer surface
 
 
-def solid_of(model: Model, displacement: NDArray[np.float64]) -> Solid:
-    """The solid of a model whose nodes have these displacements (n_nodes, 3), m."""
+def solid_of(model: Model, displacement: NDArray[np.float64], *, anatomical: bool = False) -> Solid:
+    """The solid of a model whose nodes have these displacements (n_nodes, 3), m.
+
+    anatomical: x runs to the right, y to the front and z up, as in the world of an image of labels.
+    """
     points, n, none = 1e3 * model.points, model.n_nodes, np.empty(0, np.int64)
     cells = model.hexahedra
     walls = {}
@@ -57,9 +61,20 @@ def solid_of(model: Model, displacement: NDArray[np.float64]) -> Solid:
         cloud=cloud,
         interface=between,
         walls=walls,
+        sides=_sides(points, walls, anatomical),
         tumour=seed[ConvexHull(points[seed]).simplices] if len(seed) else np.empty((0, 3), np.int64),
         surface=_surface(model, cloud, seed, interface, between),
     )
+
+
+def _sides(points: Points, walls: dict[str, NDArray[np.int64]], anatomical: bool) -> dict[int, tuple[str, str]]:
+    """Letters at the ends of axes: of the world of images, or left and right alone from where the ventricles lie."""
+    if anatomical:
+        return {0: ("L", "R"), 1: ("P", "A")}
+    if len(walls) < 2:
+        return {}
+    left, right = (points[walls[f"{side}_ventricle"], 0].mean() for side in ("left", "right"))
+    return {0: ("L", "R") if left < right else ("R", "L")}
 
 
 def displaced(solid: Solid, displacement: NDArray[np.float64]) -> Solid:

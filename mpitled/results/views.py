@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from mpitled import store
 from mpitled.errors import InputError
 from mpitled.results import report
-from mpitled.results.solid import Solid, displaced, solid_of
+from mpitled.results.solid import Solid, displaced
 
 #: Of parts, told apart by the colour-blind (Okabe and Ito 2008), and the map of displacements, as in the cuts.
 COLOURS = {"tumour": "#d55e00", "left ventricle": "#0072b2", "right ventricle": "#56b4e9", "body": "#d9d4cc"}
@@ -153,7 +153,7 @@ def show(path: Path) -> None:
         )
     plotter = pyvista().Plotter(title=f"mpitled: {outcome.title}")
     with store.open_result(directory) as result:
-        solid = solid_of(outcome.model, outcome.moved)
+        solid = outcome.solid
         times, n = result.times, result.n_frames
         largest = float(_norm(solid).vmax)
 
@@ -195,10 +195,10 @@ def _draw(directory: Path, path: Path, painter: Callable[[Solid], _Paint]) -> No
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    from mpitled.results.plot import sides
+    from mpitled.results.plot import name_sides
 
     outcome = report.read(directory)
-    solid = solid_of(outcome.model, outcome.moved)
+    solid = outcome.solid
     paint, chosen = painter(solid), views(solid, outcome.centre)
     shapes = [view.high - view.low for view in chosen]
     heights = [up / right for right, up in shapes]
@@ -212,7 +212,8 @@ def _draw(directory: Path, path: Path, painter: Callable[[Solid], _Paint]) -> No
                 title=f"{when}, {view.title}", xlabel=view.labels[0], ylabel=view.labels[1], aspect="equal",
                 xlim=(view.low[0], view.high[0]), ylim=(view.low[1], view.high[1]),
             )  # fmt: skip
-            sides(axes, solid)
+            if 0 in solid.sides:
+                name_sides(axes, solid.sides[0])
     figure.colorbar(
         ScalarMappable(_norm(solid), MAP), ax=panels[:, 1], label="after: displacement (mm)", shrink=0.6, pad=0.02
     )

@@ -72,12 +72,13 @@ def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False, resum
     """Compute a deck on all ranks; writes model.h5, result.vtkhdf, report.json and pictures into the directory.
 
     With `resume` it goes on from the last checkpoint there, on any number of ranks, or makes what is missing of a
-    result that is there; from the start where there is neither.
+    result that is there; from the start where there is neither. Without, a checkpoint of this very run is not written
+    over but refused, for it may hold days of work.
 
     The report, on every rank. InputError, UnstableError or InterruptedRun alike on all ranks.
     """
     with Interrupts(world) as interrupts:
-        found = world.on_leader(lambda: _resumable(deck, directory)) if resume else None
+        found = world.on_leader(lambda: _resumable(deck, directory) if resume else _refuse_to_lose(deck, directory))
         if found == DONE:
             return _report(directory, world)
         run = prepare(deck, directory, world, quiet=quiet, found=found)
@@ -114,6 +115,19 @@ def _resumable(deck: Deck, directory: Path) -> checkpoint.Found | str | None:
     elif found.damaged:
         print(f"note: {found.damaged}; the run goes on from {found.path.name}", file=sys.stderr, flush=True)
     return found
+
+
+def _refuse_to_lose(deck: Deck, directory: Path) -> None:
+    """InputError if the run was interrupted, and could go on."""
+    try:
+        found = checkpoint.find(directory, deck, decks.model_key(deck, included(deck)))
+    except InputError:  # of another run, or damaged
+        return
+    if found:
+        raise InputError(
+            f"{found.path}: holds this very run at {found.told['share']:.1%}; go on from there with --resume, or "
+            "remove the file to begin anew"
+        )
 
 
 def prepare(

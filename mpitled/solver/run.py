@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mpitled import deck as decks
 from mpitled import room, store
 from mpitled.deck import Deck
-from mpitled.errors import InterruptedRun, MpitledError, UnstableError, everywhere
+from mpitled.errors import InputError, InterruptedRun, MpitledError, UnstableError, everywhere
 from mpitled.loading import sphere_radius
 from mpitled.solver import checkpoint
 from mpitled.solver.halo import Halo, World
@@ -124,9 +124,11 @@ class Run:
             if self.found:
                 self._resume(self.found)
             else:
-                self.method.begin()
+                self._begin()
                 if self.world.on_leader(lambda: store.discard_checkpoints(self.directory)):
-                    self._tell("the checkpoint of an earlier run is discarded; --resume would go on from it")
+                    self._tell("the checkpoint of another run is discarded")
+                if store.is_finished(self.directory):
+                    self._tell("the result of an earlier run is there, and replaced when this one is done")
         writer = store.ResultWriter(
             self.directory,
             self.world.comm,
@@ -175,6 +177,12 @@ class Run:
         with self.phases("close"):
             writer.close(self.made | {"seconds": seconds})
         return seconds
+
+    def _begin(self) -> None:
+        try:
+            self.method.begin()
+        except InputError as error:  # of a key
+            raise InputError(f"{self.deck.path}: {error}") from None
 
     def _tell(self, words: str) -> None:
         if self.tells:

@@ -159,7 +159,7 @@ def reasons(deck: Deck, sub: Subdomain, ranks: int) -> dict[str, str]:
         "domain_forces": domains,
         "domain_survey": domains,
         "follow": "no node is turned",
-        "react": "no degree of freedom is moved",
+        "react": "no node is moved" if ranks == 1 else "no node of this rank is moved",
         "update": method,
         "relax": method,
         "change_step": method if relaxes else "",

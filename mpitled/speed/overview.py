@@ -94,8 +94,6 @@ def _deck(deck: Deck) -> Iterator[Item]:
     yield Item("prescribed dofs", f"{n} of {of}", n)
     expected = forecast.forecast(deck, model)
     yield Item("run", expected.describe(), expected._asdict() | {"loop_s": expected.loop_s})
-    said = "".join(model.remarks)
-    yield from _remarks(text for text in plausible(deck) if text.partition(": is it")[0] not in said)
     yield from _remarks(model.remarks)
 
 
@@ -134,16 +132,6 @@ def _tumour(tumour: Tumour, mesh: Mesh, *, x_is_right: bool) -> Item:
         "distance_mm": {name: 1e3 * distance for name, distance in apart.items()},
     }
     return Item("tumour", text, figures)
-
-
-def plausible(deck: Deck) -> Iterator[str]:
-    """Warnings of figures that are possible, but look like a slip of the unit."""
-    for section in deck.materials:
-        name, modulus = f"material.{section.name}", section.youngs_modulus
-        if not 1 <= modulus <= 1e12:
-            yield f"warning: {name}.youngs_modulus = {modulus:g}: is it in Pa? Brain tissue has about 3000"
-        if not 100 <= section.density <= 25000:
-            yield f"warning: {name}.density = {section.density:g}: is it in kg/m3? Tissue has about 1000"
 
 
 def _file(file: MeshFile) -> Iterator[Item]:

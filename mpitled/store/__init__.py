@@ -33,7 +33,7 @@ from mpitled.store.partitions import (
     read_part,
     write_partition,
 )
-from mpitled.store.results import Result, is_result, is_unfinished, open_result, unfinished_bytes
+from mpitled.store.results import Result, is_finished, is_result, is_unfinished, open_result, unfinished_bytes
 from mpitled.store.writer import ResultWriter, result_bytes
 
 __all__ = [
@@ -52,6 +52,7 @@ __all__ = [
     "has_partition",
     "hdf5_version",
     "is_checkpoint",
+    "is_finished",
     "is_result",
     "is_unfinished",
     "model_contents",

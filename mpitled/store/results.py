@@ -170,6 +170,11 @@ def is_unfinished(directory: Path) -> bool:
     return (Path(directory) / UNFINISHED).exists()
 
 
+def is_finished(directory: Path) -> bool:
+    """Whether a directory holds the result of a run that came to its end."""
+    return (Path(directory) / FINISHED).exists()
+
+
 def is_result(path: Path) -> bool:
     """Whether the HDF5 file is a result of ours, of whatever layout; InputError if it is no HDF5 file."""
     with open_file(path) as file, damaged(path, "give another file"):
