@@ -38,7 +38,7 @@ frames = 4
 
 # %% The deck: all keys, defaults too, in SI units.
 deck = mpitled.load_deck(deck_file, ["cloud.growth=0.3"])
-print(f"{deck.title}: {1e9 * deck.tumour.volume:.1f} mm3, cloud.growth = {deck.cloud.growth}")
+print(f"in {folder}: {deck.title}, {1e9 * deck.tumour.volume:.1f} mm3, cloud.growth = {deck.cloud.growth}")
 
 # %% The model, before anything is computed.
 model = mpitled.build_model(deck)
@@ -61,9 +61,9 @@ with mpitled.open_result(folder / "out") as result:
 try:
     import pandas
 except ImportError:
-    print("energies, J:", history["strain"])
+    print("energies, J:", history["strain_energy"])
 else:
-    print(pandas.DataFrame(history).set_index("time")[["strain", "kinetic", "min_jacobian"]])
+    print(pandas.DataFrame(history).set_index("time")[["strain_energy", "kinetic_energy", "min_jacobian"]])
 
 # %% The mesh for PyVista, if it is installed: `grid.warp_by_vector("displacement").plot()` shows it.
 try:

@@ -30,5 +30,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """For completion: what has not been used yet as well."""
-    return sorted({*globals(), *__all__})
+    """For completion: what is meant to be used, though it has not been yet."""
+    return sorted(__all__)

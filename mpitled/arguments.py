@@ -46,13 +46,14 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
     sweep = command("sweep", "a table over values of keys, a run for each; goes on where it was stopped", json=True)
     _deck(sweep, "the scene, or the folder of a sweep that goes on", "sweep_")
     varied = sweep.add_mutually_exclusive_group()
-    varied.add_argument(
+    vary: Any = varied.add_argument(
         "--vary",
         action="append",
         default=[],
         metavar="KEY=A,B,...",
         help="values of a key, each with each of others; keys that go together: KEY=A,B+KEY=C,D; repeatable",
     )
+    vary.completer = _keys
     varied.add_argument("--cases", type=Path, metavar="CSV", help="a table of cases: keys, and below them values")
     sweep.add_argument("--ranks", type=_count, metavar="R", help="ranks of each case (1); of mpirun -n N: groups of R")
     sweep.add_argument("--jobs", type=_count, default=1, metavar="J", help="cases at work at once, without mpirun (1)")
@@ -102,13 +103,14 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
 
     study = command("study", "error against run time over varied keys; goes on where it was stopped")
     _deck(study, prefix="study_")
-    study.add_argument(
+    vary = study.add_argument(
         "--vary",
         action="append",
         default=[],
         metavar="KEY=A,B,...",
         help="a family of runs; keys that go together: KEY=A,B+KEY=C,D; ranks=1,2 varies the ranks; repeatable",
     )
+    vary.completer = _keys
     study.add_argument(
         "--reference", type=Path, help="what errors are against (see compare); else the run of most work"
     )
@@ -120,7 +122,8 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
     stability.add_argument(
         "--out", type=Path, default=Path("out/stability"), metavar="DIR", help="folder of the runs (%(default)s)"
     )
-    stability.add_argument("--only", default="", metavar="AXIS,...", help="some of the axes, not all")
+    axes: Any = stability.add_argument("--only", default="", metavar="AXIS,...", help="some of the axes, not all")
+    axes.completer = _axes
 
     bench = command("bench", "speed of the step on fixed scenes, against what the machine can do")
     bench.add_argument("--json", type=Path, metavar="FILE", help="write the outcome")
@@ -170,14 +173,21 @@ def _set(added: argparse.ArgumentParser) -> None:
     option.completer = _keys
 
 
-def _keys(prefix: str, **_others: object) -> list[str]:
-    """For the shell's completion: keys of sections that are there once, and after the = their values."""
+def _keys(prefix: str, parsed_args: argparse.Namespace | None = None, **_others: object) -> list[str]:
+    """For the shell's completion: keys, of the deck if there is one on the line, and after the = their values."""
     from mpitled.deck import keys
 
+    known = keys(getattr(parsed_args, "deck", None))
     key, given, _ = prefix.partition("=")
     if given:
-        return [f"{key}={value}" for value in keys().get(key, ())]
-    return [f"{name}=" for name in keys() if name.startswith(prefix)]
+        return [f"{key}={value}" for value in known.get(key, ())]
+    return [f"{name}=" for name in known if name.startswith(prefix)]
+
+
+def _axes(prefix: str, **_others: object) -> list[str]:
+    from mpitled.batch.extremes import AXES
+
+    return [name for name in AXES if name.startswith(prefix)]
 
 
 def _model(added: argparse.ArgumentParser) -> None:

@@ -108,6 +108,8 @@ def _run(options: argparse.Namespace) -> None:
     if world.leads and not options.quiet:
         _mind_the_compiler()
     if options.dry:
+        if options.json:
+            raise InputError("run --dry: is for people; mpitled check DECK --json has its figures")
         from mpitled.speed.dry import dry_run
 
         told = dry_run(deck, _output(options), world, verbose=options.verbose)

@@ -878,13 +878,26 @@ def _digest(path: Path) -> str:
     return f"sha256:{digest.hexdigest()}"
 
 
-def keys() -> dict[str, list[str]]:
-    """Every "section.key" of sections that are there once, whatever they are called, and its values if they are few."""
-    return {
-        f"{home[1:-1]}.{about[0]}": _choices(about[1])
-        for home, _, about in _declared()
-        if about and re.fullmatch(r"\[\w+\]", home)
-    }
+def keys(path: Path | None = None) -> dict[str, list[str]]:
+    """Every "section.key" as `--set` takes it, with its values if they are few: of all sections that are there once; of
+    a deck that can be read also those of which there are many, and none of other geometries.
+    """
+    try:
+        table = _parse(path) if path else {}
+    except InputError:
+        table = {}
+    found: dict[str, list[str]] = {}
+    for home, _, about in _declared():
+        section = home.strip("[]").partition(".")[0]
+        if about is None or not home.startswith("[") or (table and section in GEOMETRIES and section not in table):
+            continue
+        of_deck = table.get(section, {})
+        if home.startswith("[["):
+            places = [f"{section}.{i}" for i in range(len(of_deck))]
+        else:
+            places = [f"{section}.{name}" for name in of_deck] if "." in home else [section]
+        found |= {f"{place}.{about[0]}": _choices(about[1]) for place in places}
+    return found
 
 
 def _choices(hint: Any) -> list[str]:

@@ -208,7 +208,7 @@ def test_table_and_vtk_files_are_references(runs, tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("missing.npz", None, "there is no such file"),
+        ("missing.npz", None, "is not there; give .npz"),
         ("r.txt", "", "is no reference; give .npz, .csv"),
         ("r.npz", "no archive", "cannot be read as .npz"),
         ("r.csv", "x,y,z,ux,uy\n", "line 1: has no column uz"),

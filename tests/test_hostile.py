@@ -136,6 +136,7 @@ def test_numbers_that_kernels_would_follow_out_of_their_arrays_are_refused(model
         model.write_bytes(whole)
         with h5py.File(model, "r+") as file:
             file[name][-1] = value
+            file[name].attrs.pop("checksum", None)  # who means harm would make it fit
         read = store.read_model if "/" not in name else lambda path: [store.read_part(path, 2, part) for part in (0, 1)]
         refused(model, r"model.h5: is damaged \(ValueError: .*\); build the model anew", read)
 

@@ -88,11 +88,11 @@ def test_a_million_steps_on_two_ranks(tmp_path):
         assert result.complete
         assert result.figures["steps"] >= STEPS
         series = {name: values[1:] for name, values in result.series.items()}
-        total = sum(series[name] for name in ("strain", "hourglass", "stabilisation", "kinetic"))
-        off = total / series["external"] - 1
+        total = sum(series[f"{name}_energy"] for name in ("strain", "hourglass", "stabilisation", "kinetic"))
+        off = total / series["external_work"] - 1
         drift = off[FRAMES // 2 :].mean() - off[: FRAMES // 2].mean()
         chance = 3 * off.std() * (4 / FRAMES) ** 0.5
-        kinetic = (series["kinetic"] / total).mean()
+        kinetic = (series["kinetic_energy"] / total).mean()
         print(
             f"{result.figures['steps']} steps in {seconds:.0f} s; {kinetic:.1%} of the energy is kinetic, in the mean"
         )

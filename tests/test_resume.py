@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -200,6 +201,31 @@ def test_info_names_what_is_damaged(stopped, monkeypatch, capsys):
             said = capsys.readouterr()
             assert ("whole" in said.out) == (status == 0)
             assert status == 0 or str(path) in said.err
+
+
+def test_nobody_computes_with_what_is_damaged(stopped, monkeypatch, capsys):
+    """A number that is as plausible as the one that it took the place of."""
+    deck, folder = stopped
+    run(deck, folder, monkeypatch, resume=True)
+    model, result = folder / "model.h5", folder / "result.vtkhdf"
+    out = ["--out", str(folder / "made")]
+    for path, array, commands in (
+        (model, "points", (["report"], ["compare", str(folder)], ["export", "--abaqus", *out], ["partition", "2"])),
+        (model, "hexahedra", (["report"], ["partition", "2"], ["predict", "--parts", "2", *out])),
+        (result, "VTKHDF/PointData/field_displacement", (["report"], ["compare", str(folder)])),
+        (result, "VTKHDF/FieldData/strain_energy", (["report", "--html"],)),
+    ):
+        whole = path.read_bytes()
+        with h5py.File(path, "r+") as file:
+            file[array][-1] = file[array][-2]
+        for name, *options in commands:
+            with pytest.raises(SystemExit) as end:
+                cli.main([name, str(folder), *options])
+            said = capsys.readouterr().err
+            assert (end.value.code, said.count("\n")) == (2, 1), (name, said)
+            assert re.search(rf"{path}: is damaged: .* is not what was written; (run the deck|build the model) a", said)
+        path.write_bytes(whole)
+    assert not (folder / "made").exists()
 
 
 def test_a_damaged_model_is_built_anew(stopped, monkeypatch, capsys):

@@ -31,8 +31,7 @@ def command(
     verb: str, deck: Path, overrides: Sequence[str], ranks: int, folder: Path, resume: bool = False
 ) -> list[str]:
     """What runs or builds (verb) a deck with overrides ("section.key=value") into a folder, or goes on with a run."""
-    start = [sys.executable, "-c", "from mpitled.cli import main; main()"]
-    words = [*start, verb, str(deck), "--out", str(folder)]
+    words = [sys.executable, "-m", "mpitled", verb, str(deck), "--out", str(folder)]
     words += [word for override in overrides for word in ("--set", override)]
     if verb == "build":
         return [*words, "--ranks", str(ranks)]

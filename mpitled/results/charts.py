@@ -286,10 +286,10 @@ def draw_rivals(panels: dict[str, list[dict[str, Any]]], path: Path, time: str, 
 
 #: Energies of a run's history by the names of its series; the hourglass's and the stabilisation's are one line.
 _ENERGIES = {
-    "external": "external work",
-    "strain": "strain energy",
+    "external_work": "external work",
+    "strain_energy": "strain energy",
     "artificial": "hourglass control and stabilisation",
-    "kinetic": "kinetic energy",
+    "kinetic_energy": "kinetic energy",
     "taken": "taken by damping, less what changed masses gave",
 }
 
@@ -299,8 +299,8 @@ def draw_history(times: NDArray[np.float64], series: Mapping[str, NDArray[np.flo
     figure = Figure(figsize=(13, 4.3), layout="constrained")
     FigureCanvasAgg(figure)
     energies, ratio, smallest = figure.subplots(1, 3)
-    values = dict(series) | {"artificial": series["hourglass"] + series["stabilisation"]}
-    values["taken"] = series["dissipated"] - series["added"]
+    values = dict(series) | {"artificial": series["hourglass_energy"] + series["stabilisation_energy"]}
+    values["taken"] = series["dissipated_energy"] - series["energy_of_added_mass"]
     largest = max(float(np.abs(values[name]).max()) for name in _ENERGIES) or 1.0
     power = min(0, 3 * math.floor(math.log10(largest) / 3))
     scale, prefix = 10.0**-power, {0: "", -3: "m", -6: "\u00b5", -9: "n"}.get(power)

@@ -23,6 +23,7 @@ from mpitled.readers import meshfile
 from mpitled.readers.meshfile import FARTHEST
 from mpitled.results import field
 from mpitled.results.field import Field
+from mpitled.solver import hexahedra
 
 #: What the tags of a reference mean; fixed and moved places are prescribed, so that they say nothing of the solution.
 TAGS = ("interior", "free surface", "fixed", "moved", "material interface")
@@ -72,6 +73,7 @@ def compare(result: Path, reference: Path, beyond: float | None = None) -> dict[
         "in_hexahedra": int(np.count_nonzero(values.source == field.IN_HEXAHEDRON)),
         "in_cloud": int(np.count_nonzero(values.source == field.IN_CLOUD)),
         "outside": int(np.count_nonzero(values.source == field.OUTSIDE)),
+        "beside_the_body": int(np.count_nonzero(values.outside > _edge(ours.model))),
         "farthest_outside_mm": 1e3 * float(values.outside.max(initial=0)),
         "groups": {name: _figures(theirs, difference, chosen) for name, chosen in groups.items() if chosen.any()},
     }
@@ -85,6 +87,11 @@ def table(figures: dict[str, Any]) -> str:
         f"outside (at most {figures['farthest_outside_mm']:.3f} mm); "
         f"largest displacement {figures['largest_displacement_mm']:.3f} mm",
     ]
+    if figures["beside_the_body"]:
+        lines.append(
+            f"warning: {figures['beside_the_body']} places lie more than a cell's edge outside of the body, where it "
+            "has no field: are both of one body, and in metres?"
+        )
     if keys := figures["scene_differs_in"]:
         more = f" and {len(keys) - _SHOWN} more" if len(keys) > _SHOWN else ""
         lines.append(f"note: the scenes of both differ in {', '.join(keys[:_SHOWN])}{more}")
@@ -115,6 +122,12 @@ def _differing(ours: dict[str, Any], theirs: dict[str, Any] | None) -> list[str]
         if deck.is_of_scene(name) and not moved:  # a file may lie elsewhere, and be the same
             found.append(name)
     return found
+
+
+def _edge(model: Model) -> float:
+    """Of a hexahedron, in the mean, m: surfaces of bodies that are meshed otherwise differ by less."""
+    sizes = hexahedra.volumes(model.points, model.hexahedra)
+    return float(np.cbrt(sizes.mean())) if len(sizes) else float("inf")
 
 
 def _largest(displacement: NDArray[np.float64]) -> float:
@@ -174,7 +187,7 @@ def read_reference(path: Path, ours: Field) -> Reference:
     the package vtk and a point array of displacements. InputError if there is no such file or it is not like that.
     """
     if not path.exists():
-        raise InputError(f"{path}: there is no such file")
+        raise InputError(f"{path}: is not there; give .npz, .csv, .vtu, .vtkhdf or the folder of a run")
     if path.is_dir():
         return _of_result(path)
     if path.suffix == ".npz":

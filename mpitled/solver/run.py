@@ -135,7 +135,7 @@ class Run:
             self.sub.rows,
             self.deck.output.frames + 1,
             self._metadata(),
-            series=_SERIES,
+            series=list(_SERIES),
             frames=self.frames,
         )
         if self.force_halo is not None:  # what was spent before the loop is not the loop's
@@ -409,7 +409,7 @@ class Run:
         if sub.rows.n_domains:
             field = np.concatenate([self._owned(self._field(u)), at_points])
             displacement = np.concatenate([displacement, at_points])
-        series = {name: self.watch.figures[name] for name in _SERIES}
+        series = {name: self.watch.figures[key] for name, key in _SERIES.items()}
         self.frames, self.written = self.frames + 1, frame_time
         writer.write_frame(
             frame_time,
@@ -452,7 +452,7 @@ class Run:
         )
         hexahedra, domains, halo_share, computed, peak = table.T
         cells = hexahedra.sum() + domains.sum()
-        figures = self.watch.figures or dict.fromkeys(_SERIES, float("nan"))
+        figures = self.watch.figures or dict.fromkeys(_SERIES.values(), float("nan"))
         return {
             "ranks": world.size,
             "steps": state.step,
@@ -498,7 +498,10 @@ def _remedy(deck: Deck) -> str:
     return f"load more slowly ({slower}), or {finer}"
 
 
-_SERIES = (
-    "external", "strain", "hourglass", "stabilisation", "kinetic", "added", "added_mass", "dissipated", "min_jacobian",
-    "step_ratio", "balance_error", "kinetic_ratio",
-)  # fmt: skip
+#: Figures of a look that every frame has, by their names in the result; energies in J.
+_SERIES = {
+    "external_work": "external", "strain_energy": "strain", "hourglass_energy": "hourglass",
+    "stabilisation_energy": "stabilisation", "kinetic_energy": "kinetic", "energy_of_added_mass": "added",
+    "dissipated_energy": "dissipated", "added_mass": "added_mass", "min_jacobian": "min_jacobian",
+    "step_ratio": "step_ratio", "balance_error": "balance_error", "kinetic_ratio": "kinetic_ratio",
+}  # fmt: skip

@@ -144,6 +144,14 @@ def checksum_of(dataset: h5py.Dataset, first: int = 0, count: int | None = None)
     )
 
 
+def whole(dataset: h5py.Dataset) -> NDArray[Any]:
+    """All of a dataset of a model; InputError if it does not have the checksum, if any, that it was written with."""
+    values = dataset[...]
+    if dataset.attrs.get("checksum", total := checksum.total([checksum.share(values, 0)])) != total:
+        raise InputError(f"{dataset.file.filename}: is damaged: {dataset.name} is not what was written; {REBUILD}")
+    return values
+
+
 def first_broken(file: h5py.File) -> str | None:
     """The first dataset that has another checksum than it was written with."""
 

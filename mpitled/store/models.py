@@ -26,6 +26,7 @@ from mpitled.store.files import (
     put,
     read_json,
     replacing,
+    whole,
     write_json,
 )
 
@@ -99,7 +100,7 @@ def write_model(path: Path, model: Model, key: str, scene: Mapping[str, Any] | N
 def read_model(path: Path) -> Model:
     """The whole model. InputError if the file is missing, not a model, or of another layout."""
     with open_model(path) as file:
-        arrays = {name: file[name][...] for name in MODEL_ARRAYS}
+        arrays = {name: whole(file[name]) for name in MODEL_ARRAYS}
         n_nodes, n_domains, n_cells = len(file["points"]), len(file["domains"]), len(file["material"])
         node_sets, cell_sets, materials = (
             _read_sets(file["node_sets"]),
@@ -118,7 +119,7 @@ def read_model(path: Path) -> Model:
             n_fe_nodes=int(file.attrs["n_fe_nodes"]),
             node_sets=node_sets,
             cell_sets=cell_sets,
-            surface_areas=file["surface_areas"][...] if "surface_areas" in file else None,
+            surface_areas=whole(file["surface_areas"]) if "surface_areas" in file else None,
             materials=materials,
             figures=_read_figures(file),
             remarks=_read_remarks(file),
@@ -128,16 +129,16 @@ def read_model(path: Path) -> Model:
 def read_cells(path: Path) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Hexahedra (n, 8), support domains (m, k) and their points (m, 3), m: all that a partition is made from."""
     with open_model(path) as file:
-        hexahedra, domains = file["hexahedra"][...], file["domains"][...]
+        hexahedra, domains = whole(file["hexahedra"]), whole(file["domains"])
         for cells in (hexahedra, domains):
             check_numbers(cells, len(file["points"]), "cells")
-        return hexahedra, domains, file["domain_points"][...]
+        return hexahedra, domains, whole(file["domain_points"])
 
 
 def read_points(path: Path) -> NDArray[np.float64]:
     """Places (n_nodes, 3), m, of the nodes."""
     with open_model(path) as file:
-        return np.asarray(file["points"][...], np.float64)
+        return np.asarray(whole(file["points"]), np.float64)
 
 
 def model_key(path: Path) -> str | None:
@@ -279,7 +280,7 @@ def _write_sets(group: h5py.Group, sets: dict[str, NDArray[np.int64]]) -> None:
 
 
 def _read_sets(group: h5py.Group) -> dict[str, NDArray[np.int64]]:
-    members, offsets = group["members"][...], group["offsets"][...]
+    members, offsets = whole(group["members"]), whole(group["offsets"])
     check_numbers(offsets, len(members) + 1, "offsets")
     slices = [members[start:stop] for start, stop in pairwise(offsets)]
     return dict(zip(read_json(group, "names"), slices, strict=True))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from mpitled.errors import InputError, damaged
 from mpitled.store.files import AGAIN, attribute, checksum_of, first_broken, matching, open_file, read_json, read_rows
 
 #: Results of another layout are refused.
-RESULT_LAYOUT = 1
+RESULT_LAYOUT = 2
 FINISHED, UNFINISHED = "result.vtkhdf", "result.partial.vtkhdf"
 #: Of what is in a result, as the attribute "units" of its dataset says too; decks and reports are in mm.
 UNITS = {"Points": "m", "displacement": "m", "field_displacement": "m", "Values": "s"}
@@ -35,6 +36,11 @@ class Result:
 
     def __init__(self, file: h5py.File, path: Path) -> None:
         self._file, self._grid, self.path = file, file["VTKHDF"], path
+
+    @cached_property
+    def _of_mesh(self) -> dict[str, int]:
+        """Checksums of what is the same in every frame."""
+        return dict(read_json(self._file["mpitled"], "mesh_checksums"))
 
     def __enter__(self) -> Result:
         return self
@@ -60,22 +66,18 @@ class Result:
     def check(self) -> None:
         """Read all of the file; InputError names what does not have the checksum that it was written with."""
         broken = first_broken(self._file)
-        for name, total in read_json(self._file["mpitled"], "mesh_checksums").items():
+        for name, total in self._of_mesh.items():
             if checksum_of(self._grid[name]) != total:
                 broken = broken or name
-        times, series = self.times, self.series
         for name in (*(f"PointData/{n}" for n in self.names("Point")), *(f"CellData/{n}" for n in self.names("Cell"))):
             n_rows = int(self._grid[f"NumberOf{name.partition('Data')[0]}s"][0])
             totals = self._file[f"mpitled/checksums/{name}"]
             for frame in range(self.n_frames):
                 if checksum_of(self._grid[name], frame * n_rows, n_rows) != totals[frame]:
                     broken = broken or f"{name} of frame {frame}"
-        for frame in range(self.n_frames):
-            numbers = series_of(times[frame], {name: values[frame] for name, values in series.items()})
-            if checksum.total([checksum.share(numbers, 0)]) != self._file["mpitled/checksums/series"][frame]:
-                broken = broken or f"time and energies of frame {frame}"
         if broken:
-            raise InputError(f"{self.path}: is damaged: {broken} is not what was written; run the deck again")
+            raise self._broken(broken)
+        _ = self._numbers
 
     def names(self, kind: str) -> list[str]:
         """What each frame holds for each "Point" or "Cell"."""
@@ -89,23 +91,34 @@ class Result:
     @property
     def times(self) -> NDArray[np.float64]:
         """(n_frames,), s."""
-        return self._grid["Steps/Values"][: self.n_frames]
+        return self._numbers[0]
 
     @property
     def series(self) -> dict[str, NDArray[np.float64]]:
         """Numbers of each frame, (n_frames,), by name."""
-        return {name: values[: self.n_frames] for name, values in self._grid.get("FieldData", {}).items()}
+        return self._numbers[1]
+
+    @cached_property
+    def _numbers(self) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
+        n = self.n_frames
+        times = self._grid["Steps/Values"][:n]
+        series = {name: values[:n] for name, values in self._grid.get("FieldData", {}).items()}
+        for frame, total in enumerate(self._file["mpitled/checksums/series"][:n]):
+            numbers = series_of(times[frame], {name: values[frame] for name, values in series.items()})
+            if checksum.total([checksum.share(numbers, 0)]) != total:
+                raise self._broken(f"time and energies of frame {frame}")
+        return times, series
 
     @property
     def points(self) -> NDArray[np.float64]:
         """(nodes + integration points, 3), m, undeformed."""
-        return self._grid["Points"][...]
+        return self._whole("Points", self._grid["Points"][...])
 
     @property
     def hexahedra(self) -> NDArray[np.int64]:
         """(n_hexahedra, 8), rows of `points`."""
         n_hexahedra = int(np.count_nonzero(self.cell_data("kind") == HEXAHEDRON))
-        return self._grid["Connectivity"][: 8 * n_hexahedra].reshape(-1, 8)
+        return self._whole("Connectivity", self._grid["Connectivity"][...])[: 8 * n_hexahedra].reshape(-1, 8)
 
     def point_data(self, name: str, frame: int = 0) -> NDArray[Any]:
         """Values at `points` in a frame (negative: from the last); of what does not change in any."""
@@ -150,7 +163,23 @@ class Result:
 
     def _rows(self, kind: str, name: str, frame: int) -> NDArray[Any]:
         first = int(self._grid[f"Steps/{kind}DataOffsets/{name}"][: max(1, self.n_frames)][frame])
-        return self._grid[f"{kind}Data/{name}"][first : first + int(self._grid[f"NumberOf{kind}s"][0])]
+        values = self._grid[f"{kind}Data/{name}"][first : first + int(self._grid[f"NumberOf{kind}s"][0])]
+        return self._whole(f"{kind}Data/{name}", values, frame)
+
+    def _whole(self, name: str, values: NDArray[Any], frame: int = 0) -> NDArray[Any]:
+        """Values that have the checksum that they were written with; InputError if they have not."""
+        of_frames = self._file["mpitled/checksums"].get(name)
+        if of_frames is None:
+            expected, where = self._of_mesh[name], name
+        else:
+            frame %= self.n_frames
+            expected, where = int(of_frames[frame]), f"{name} of frame {frame}"
+        if checksum.total([checksum.share(values, 0)]) != expected:
+            raise self._broken(where)
+        return values
+
+    def _broken(self, what: str) -> InputError:
+        return InputError(f"{self.path}: is damaged: {what} is not what was written; run the deck again")
 
 
 def _ascending(numbers: NDArray[np.int64]) -> NDArray[np.int64]:

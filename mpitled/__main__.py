@@ -1,0 +1,5 @@
+"""`python -m mpitled` is the command."""
+
+from mpitled.cli import main
+
+main()
