@@ -297,6 +297,7 @@ class Output:
 
     frames: int = key("frames over the load, the undeformed one not counted", 10, limits="[1, inf)")
     pictures: bool = key("draw the deformed body", True)
+    stress: bool = key("also the Cauchy stress of every cell in every frame, in Pa: xx, yy, zz, xy, yz, xz", False)
     checkpoint_minutes: float = key(
         "time from one checkpoint to the next, for `run --resume`; 0: only when the run is interrupted", 10.0, "min",
         "[0, inf)",

@@ -148,6 +148,17 @@ class RunResult:
         return self._frames(lambda frame: self._result.in_cells("J", frame))
 
     @property
+    def stress(self) -> Frames:
+        """(n_cells, 6), Pa, in each frame: Cauchy's of hexahedra, then of support domains; xx, yy, zz, xy, yz, xz.
+
+        Of single cells: where Poisson's ratio is near 0.5 their pressures alternate, and means of neighbours tell more.
+        InputError if the run wrote none.
+        """
+        if "stress" not in self._result.names("Cell"):
+            raise InputError(f"{self.path}: holds no stress; run the deck with output.stress = true")
+        return self._frames(lambda frame: self._result.in_cells("stress", frame))
+
+    @property
     def history(self) -> dict[str, NDArray[np.float64]]:
         """Energies (J) and other numbers, (n_frames,), by name, with "time": as pandas.DataFrame takes it."""
         return {"time": self.times, **self._result.series}

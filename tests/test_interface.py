@@ -15,6 +15,7 @@ from conftest import ENVIRONMENT, ROOT, mpitled
 
 import mpitled as package
 from mpitled import store
+from mpitled.solver.stress import cauchy
 
 CUBE = ROOT / "jobs" / "validation" / "cube.toml"
 
@@ -23,7 +24,13 @@ CUBE = ROOT / "jobs" / "validation" / "cube.toml"
 def result(tmp_path_factory):
     """A small run through the interface: its folder and its report."""
     out = tmp_path_factory.mktemp("interface") / "out"
-    keys = ["block.elements=[3,3,3]", "block.cloud=all", "solver.method=dynamic-relaxation", "output.frames=2"]
+    keys = [
+        "block.elements=[3,3,3]",
+        "block.cloud=all",
+        "solver.method=dynamic-relaxation",
+        "output.frames=2",
+        "output.stress=true",
+    ]
     return out, package.run_deck(CUBE, out, keys)
 
 
@@ -70,10 +77,21 @@ def test_arrays_are_read_frame_by_frame_in_the_models_order(result):
         with pytest.raises(IndexError, match="3 frames"):
             opened.displacement[3]
         last = opened.displacement
+        assert opened.stress.shape == (3, model.n_cells, 6)
+        assert not opened.stress[0].any()
+        rows = store.read_part(out / "model.h5", 1, 0)
+        parameters = store.open_result(out).at_nodes("displacement", -1)
+        np.testing.assert_array_equal(opened.stress[-1], cauchy(rows, parameters.T.copy(), "mean"))
     for read in (lambda: opened.points, lambda: last[0]):
         with pytest.raises(package.InputError, match="is closed"):
             read()
     assert repr(opened).endswith("closed>")
+
+
+def test_a_result_without_stress_says_how_to_have_it(tmp_path):
+    package.run_deck(CUBE, tmp_path, ["block.elements=[3,3,3]", "solver.method=dynamic-relaxation"])
+    with package.open_result(tmp_path) as opened, pytest.raises(package.InputError, match=r"output\.stress = true"):
+        _ = opened.stress
 
 
 def test_what_other_libraries_take(result):

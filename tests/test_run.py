@@ -18,7 +18,11 @@ from conftest import ENVIRONMENT, ROOT, complaint, mpitled, ranks, script
 from scenes import MIXED, TUMOUR
 from scipy.optimize import brentq
 
+from mpitled import store
+from mpitled.deck import load_deck
 from mpitled.loading import loading_curve
+from mpitled.solver import job
+from mpitled.solver.stress import cauchy
 from mpitled.store import open_result
 
 SLIDING = "".join(f'[[fixed]]\nnodes = "{face}0"\ndirections = ["{face}"]\n' for face in "xyz")
@@ -408,3 +412,33 @@ def test_the_death_of_one_rank_ends_the_others(tmp_path):
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
         os.kill(int(children[0]), signal.SIGKILL)
         assert process.wait(timeout=30) != 0
+
+
+@pytest.mark.parametrize("rule", ["mean", "centre"])
+def test_the_stress_of_results_is_the_closed_form_where_the_gradient_is_the_same_everywhere(tmp_path, rule):
+    """Cauchy's: mu/J (b - I) + lambda (J - 1) I, of both kinds of cell and two materials, on one part or two."""
+    text = MIXED.replace("[material.brain]", '[material.stiff]\ncells = ["ball"]\nyoungs_modulus = 9000.0\n'
+        'poissons_ratio = 0.3\n[sphere.ball]\ncentre = [15.0, 12.0, 12.0]\nradius = 6.0\n[material.brain]')  # fmt: skip
+    (tmp_path / "scene.toml").write_text(text + '[[fixed]]\nnodes = "x0"\n')
+    path, _ = job.build(load_deck(tmp_path / "scene.toml"), tmp_path)
+    job.divide(path, 2, 0)
+    X = np.array([[1.2, 0.3, -0.1], [0.05, 0.9, 0.2], [-0.15, 0.1, 1.1]])
+    b, J = X @ X.T, np.linalg.det(X)
+    model = store.read_model(path)
+    assert len(np.unique(model.material)) == 2
+    mu, lam = (
+        np.array([getattr(m, name) for m in model.materials])[model.material, None, None] for name in ("mu", "lam")
+    )
+    expected = mu / J * (b - np.eye(3)) + lam * (J - 1) * np.eye(3)
+    for n_parts in (1, 2):
+        seen = 0
+        for part in range(n_parts):
+            rows = store.read_part(path, n_parts, part)
+            u = (X - np.eye(3)) @ rows.read("points").T
+            xx, yy, zz, xy, yz, xz = cauchy(rows, u, rule).T
+            found = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).transpose(2, 0, 1)
+            of_part = expected[rows.read("cells")]
+            # Sums of 20 products that are ten times their sum, and lambda is that over the stress: 1e3 roundings.
+            assert np.abs(found - of_part).max() < 1e3 * np.finfo(float).eps * np.abs(expected).max()
+            seen += len(found)
+        assert seen == model.n_cells

@@ -27,6 +27,7 @@ from mpitled.solver.memory import Kept, Memory, Parts, recall, remember
 from mpitled.solver.progress import Interrupts, Phases, Progress
 from mpitled.solver.relaxation import Relaxation
 from mpitled.solver.step import State, Term
+from mpitled.solver.stress import cauchy
 from mpitled.solver.subdomain import Subdomain
 from mpitled.solver.watch import BALANCE_LIMIT, Watch
 
@@ -107,7 +108,7 @@ class Run:
     @property
     def output_bytes(self) -> int:
         """Size of the result."""
-        return store.result_bytes(self.sub.rows, self.deck.output.frames + 1)
+        return store.result_bytes(self.sub.rows, self.deck.output.frames + 1, cell_data(self.deck))
 
     def _check_disc(self) -> None:
         what = f"the result of {self.deck.output.frames + 1} frames"
@@ -135,6 +136,7 @@ class Run:
             self.sub.rows,
             self.deck.output.frames + 1,
             self._metadata(),
+            cell_data=cell_data(self.deck),
             series=list(_SERIES),
             frames=self.frames,
         )
@@ -409,12 +411,15 @@ class Run:
         if sub.rows.n_domains:
             field = np.concatenate([self._owned(self._field(u)), at_points])
             displacement = np.concatenate([displacement, at_points])
+        of_cells: dict[str, NDArray[np.floating]] = {"J": self.method.survey.jacobian[:-1]}
+        if self.deck.output.stress:
+            of_cells["stress"] = cauchy(sub.rows, u, self.deck.hexahedra.gradient)
         series = {name: self.watch.figures[key] for name, key in _SERIES.items()}
         self.frames, self.written = self.frames + 1, frame_time
         writer.write_frame(
             frame_time,
             {"displacement": displacement, "field_displacement": field},
-            {"J": self.method.survey.jacobian[:-1]},
+            of_cells,
             series,
         )
 
@@ -485,6 +490,11 @@ class Run:
                 "at_end": figures["kinetic_ratio"],
             },
         }
+
+
+def cell_data(deck: Deck) -> dict[str, int]:
+    """Components of what each frame holds of cells."""
+    return {"J": 1} | ({"stress": 6} if deck.output.stress else {})
 
 
 def _remedy(deck: Deck) -> str:

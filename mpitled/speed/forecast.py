@@ -16,6 +16,7 @@ from mpitled.model import Model
 from mpitled.solver.halo import World
 from mpitled.solver.march import March
 from mpitled.solver.relaxation import Relaxation
+from mpitled.solver.run import cell_data
 from mpitled.solver.subdomain import PRECISIONS, Subdomain, localise
 
 #: Times that each term is called to tell how long it takes; the fastest counts, for others may use the machine too.
@@ -70,7 +71,8 @@ def forecast(deck: Deck, model: Model) -> Forecast:
     method.warm_up()
     method.begin()
     seconds, survey = measure(method)
-    return expect(method, sum(seconds.values()), survey, store.result_bytes(sub.rows, deck.output.frames + 1))
+    size = store.result_bytes(sub.rows, deck.output.frames + 1, cell_data(deck))
+    return expect(method, sum(seconds.values()), survey, size)
 
 
 def first_rank(deck: Deck, path: Path, ranks: int = 1) -> tuple[Subdomain, March | Relaxation]:

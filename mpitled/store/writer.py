@@ -45,18 +45,18 @@ from mpitled.store.results import (
 
 _VTK_VERTEX, _VTK_HEXAHEDRON = 1, 12
 #: Bytes in a result, of the mesh and of each frame: of a point (place, two numbers; two displacements), of a cell
-#: (offset, type, number, material, kind, part; J), and of a corner of a cell.
-_POINT_BYTES, _CELL_BYTES, _CORNER_BYTES = (24 + 16, 48), (8 + 1 + 8 + 2 + 1 + 4, 8), 8
+#: (offset, type, number, material, kind, part; what its frames hold is 8 for each component), and of a cell's corner.
+_POINT_BYTES, _CELL_BYTES, _CORNER_BYTES = (24 + 16, 48), 8 + 1 + 8 + 2 + 1 + 4, 8
 #: Of the tables of steps for each frame; and of the deck, and HDF5's own.
 _FRAME_BYTES, _ON_TOP = 537, 47_800
 
 
-def result_bytes(rows: PartRows, n_frames: int) -> int:
+def result_bytes(rows: PartRows, n_frames: int, cell_data: Mapping[str, int]) -> int:
     """Size of the whole model's result.vtkhdf with so many frames, to some kilobytes; see `ResultWriter`."""
     n_hexahedra, n_vertices = rows.n_hexahedra, rows.n_nodes - rows.n_fe_nodes + rows.n_domains
     n_points = rows.n_nodes + rows.n_domains
     size = sum(_POINT_BYTES[k] * n_points * n for k, n in enumerate((1, n_frames)))
-    size += sum(_CELL_BYTES[k] * (n_hexahedra + n_vertices) * n for k, n in enumerate((1, n_frames)))
+    size += (_CELL_BYTES + 8 * sum(cell_data.values()) * n_frames) * (n_hexahedra + n_vertices)
     return size + _CORNER_BYTES * (8 * n_hexahedra + n_vertices) + _FRAME_BYTES * n_frames + _ON_TOP
 
 
