@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from mpitled import arguments
-from mpitled.errors import InputError, MpitledError
+from mpitled.errors import InputError, InterruptedRun, MpitledError
 
 if TYPE_CHECKING:
     from mpitled.batch.cases import Sweep
@@ -39,6 +39,9 @@ def main(words: Sequence[str] | None = None) -> NoReturn:
         _end(error, error.status)
     except BrokenPipeError:
         os._exit(1)
+    except KeyboardInterrupt:  # of what has nothing to keep; a run and a sweep end in order
+        print("mpitled: interrupted", file=sys.stderr, flush=True)
+        sys.exit(InterruptedRun.status)
     except ImportError as error:
         _missing(error)
     except Exception as error:

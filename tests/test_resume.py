@@ -135,8 +135,15 @@ def test_a_run_that_could_go_on_is_not_written_over(stopped, monkeypatch, capsys
         run(deck, folder, monkeypatch)
     assert last.exists()
     other = load_deck(deck, ["solver.load_time=0.1"])
+    with pytest.raises(
+        InputError, match=r"h5: holds a run at .*% that was written for solver\.load_time = 0\.2.* --out"
+    ):
+        job.run(other, folder, World())
+    assert last.exists()
+    for path in (last, before):
+        path.write_bytes(path.read_bytes()[:1000])
     assert job.run(other, folder, World())["complete"]
-    assert "note: the checkpoint of another run is discarded" in capsys.readouterr().err
+    assert "note: a checkpoint that is damaged is discarded" in capsys.readouterr().err
     assert not last.exists()
     assert not before.exists()
     assert run(deck, folder, monkeypatch)["resumed_at_step"] == 0

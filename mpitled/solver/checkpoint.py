@@ -38,19 +38,29 @@ def marks(deck: Deck, model_key: str) -> dict[str, Any]:
 def find(directory: Path, deck: Deck, model_key: str) -> Found | None:
     """The last whole checkpoint in a directory, or None; InputError if it is another run's, or none is whole."""
     damaged: list[str] = []
+    found = newest(directory, damaged)
+    if found and (what := other(found.told, deck, model_key)):
+        raise InputError(f"{found.path}: {what}; put that back, or remove the file to begin anew")
+    if damaged and not found:
+        raise InputError(f"{'; '.join(damaged)}; begin anew, without --resume")
+    return found
+
+
+def newest(directory: Path, damaged: list[str] | None = None) -> Found | None:
+    """The last whole checkpoint in a directory, of whatever run; `damaged` is told what is wrong with others."""
+    damaged = [] if damaged is None else damaged
     for path in (Path(directory) / name for name in store.CHECKPOINTS):
         if path.exists():
             try:
-                told = store.checkpoint_contents(path)
+                return Found(path, store.checkpoint_contents(path), "; ".join(damaged))
             except InputError as error:
                 damaged.append(str(error))
-                continue
-            if what := _other(told, deck, model_key):
-                raise InputError(f"{path}: {what}; put that back, or begin anew without --resume")
-            return Found(path, told, "; ".join(damaged))
-    if damaged:
-        raise InputError(f"{'; '.join(damaged)}; begin anew, without --resume")
     return None
+
+
+def reached(told: Mapping[str, Any]) -> str:
+    """How far the run of a checkpoint is."""
+    return "after its load" if told["seeks_distance"] else f"at {told['share']:.1%}"
 
 
 def is_done(directory: Path, deck: Deck, model_key: str) -> bool:
@@ -59,12 +69,12 @@ def is_done(directory: Path, deck: Deck, model_key: str) -> bool:
         return False
     try:
         with store.open_result(directory) as result:
-            return not _other(result.metadata["marks"], deck, model_key)
+            return not other(result.metadata["marks"], deck, model_key)
     except (InputError, KeyError):
         return False
 
 
-def _other(told: dict[str, Any], deck: Deck, model_key: str) -> str:
+def other(told: dict[str, Any], deck: Deck, model_key: str) -> str:
     """What of another run is told; "" if it is the same."""
     here = marks(deck, model_key)
     if told["program"] != here["program"]:

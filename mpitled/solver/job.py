@@ -11,7 +11,7 @@ import partition
 from mpitled import deck as decks
 from mpitled import store
 from mpitled.deck import Deck
-from mpitled.errors import InputError, MpitledError, everywhere
+from mpitled.errors import InputError, MpitledError, UnstableError, everywhere
 from mpitled.solver import checkpoint
 from mpitled.solver.halo import World
 from mpitled.solver.progress import Interrupts, Phases
@@ -40,7 +40,7 @@ def build(deck: Deck, directory: Path, quiet: bool = True) -> tuple[Path, bool]:
     from mpitled import preprocess  # only the rank that builds needs the meshers
 
     if not quiet:
-        print("note: the model is built", file=sys.stderr, flush=True)
+        print("note: building the model", file=sys.stderr, flush=True)
     store.write_model(path, preprocess.build(deck), key, decks.canonical(deck))
     return path, True
 
@@ -73,7 +73,7 @@ def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False, resum
 
     With `resume` it goes on from the last checkpoint there, on any number of ranks, or makes what is missing of a
     result that is there; from the start where there is neither. Without, a checkpoint of this very run is not written
-    over but refused, for it may hold days of work.
+    over but refused, nor is that of another, for it may hold days of work.
 
     The report, on every rank. InputError, UnstableError or InterruptedRun alike on all ranks.
     """
@@ -87,6 +87,8 @@ def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False, resum
         except MpitledError as error:
             if error.everywhere:
                 run.free()
+                if isinstance(error, UnstableError):  # whoever goes on from where it was arrives here again
+                    world.on_leader(lambda: store.discard_checkpoints(directory))
             raise
         run.free()
         with run.phases("report"):
@@ -118,16 +120,20 @@ def _resumable(deck: Deck, directory: Path) -> checkpoint.Found | str | None:
 
 
 def _refuse_to_lose(deck: Deck, directory: Path) -> None:
-    """InputError if the run was interrupted, and could go on."""
-    try:
-        found = checkpoint.find(directory, deck, decks.model_key(deck, included(deck)))
-    except InputError:  # of another run, or damaged
+    """InputError if a run that could go on is there, this one or another."""
+    found = checkpoint.newest(directory)
+    if found is None:
         return
-    if found:
+    other = checkpoint.other(found.told, deck, decks.model_key(deck, included(deck)))
+    if other:
         raise InputError(
-            f"{found.path}: holds this very run at {found.told['share']:.1%}; go on from there with --resume, or "
-            "remove the file to begin anew"
+            f"{found.path}: holds a run {checkpoint.reached(found.told)} that {other}; give this one another folder "
+            "with --out, or remove the file"
         )
+    raise InputError(
+        f"{found.path}: holds this very run {checkpoint.reached(found.told)}; go on from there with --resume, or "
+        "remove the file to begin anew"
+    )
 
 
 def prepare(

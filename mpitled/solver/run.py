@@ -36,6 +36,8 @@ from mpitled.solver.watch import BALANCE_LIMIT, Watch
 SAVED, RECOVERIES, ANEW = 5, 5, 3
 #: A state whose energies are farther out of balance, as a share of what ends a run, is ill already.
 HEALTHY = 0.2
+#: A relaxation that stalls farther from the static solution, as a share of the largest displacement, has none to offer.
+NO_SOLUTION = 0.02
 #: What a run is asked at a look: nothing, to keep a checkpoint, to keep one and end.
 KEEP, END = 1, 2
 
@@ -127,7 +129,7 @@ class Run:
             else:
                 self._begin()
                 if self.world.on_leader(lambda: store.discard_checkpoints(self.directory)):
-                    self._tell("the checkpoint of another run is discarded")
+                    self._tell("a checkpoint that is damaged is discarded")
                 if store.is_finished(self.directory):
                     self._tell("the result of an earlier run is there, and replaced when this one is done")
         writer = store.ResultWriter(
@@ -262,8 +264,10 @@ class Run:
                 self._keep(writer)
         if self.watch.request == END:
             with everywhere():
-                share = self.method.progress if self.loaded is None else 1.0
-                raise InterruptedRun(f"interrupted at {share:.1%} of the run; the same command with --resume goes on")
+                where = f"at {self.method.progress:.1%} of the run"
+                if self.loaded is not None:
+                    where = "after the load, on the way to its distance from the static solution"
+                raise InterruptedRun(f"interrupted {where}; the same command with --resume goes on")
         return True
 
     def _look(self) -> None:
@@ -351,10 +355,16 @@ class Run:
 
     def _end_if_stalled(self, relaxation: Relaxation) -> None:
         if relaxation.stalled:
+            largest = np.abs(relaxation.state.u[:, : self.sub.n_nodes]).max()
+            largest = float(self.world.gather([largest]).max())
+            remedy = f"give solver.tolerance = {3e3 * relaxation.best:.2g} or more"
+            if self.deck.solver.precision == "single":
+                remedy += ", or solver.precision = double"
+            if relaxation.best > NO_SOLUTION * largest:
+                remedy = f"that is {relaxation.best / largest:.0%} of the largest displacement; {self.watch.remedy}"
             raise UnstableError(
                 f"the relaxation comes no nearer to the static solution than {1e3 * relaxation.best:.2g} mm, by its "
-                f"own estimate; give solver.tolerance = {3e3 * relaxation.best:.2g} or more"
-                + (", or solver.precision = double" if self.deck.solver.precision == "single" else "")
+                f"own estimate; {remedy}"
             )
 
     def _distance_to_static(self, writer: store.ResultWriter) -> float:
