@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -307,9 +308,9 @@ def test_files_that_are_no_image(tmp_path):
     [
         # The ellipsoid ends at x = 37 mm, and a cube's edge is 4 mm.
         ((0.5, -0.005, 0.007), r"outside the brain, 46[1-7](\.\d)? mm from the nearest tissue"),
-        ((0.003, 0.0362, 0.007), "room|outside"),
+        ((0.003, 0.0362, 0.007), "from the skull's|outside"),
         ((-0.0035, -0.005, 0.007), "in the left ventricle"),
-        ((0.003, -0.043, 0.007), "so near to the skull|outer surface or a ventricle"),
+        ((0.003, -0.043, 0.007), "mm from the skull's hexahedra"),
     ],
 )
 def test_a_tumour_that_does_not_lie_in_tissue_is_refused(tmp_path, centre, message):
@@ -318,6 +319,28 @@ def test_a_tumour_that_does_not_lie_in_tissue_is_refused(tmp_path, centre, messa
         mesh_labels(labels_of(path), deck.Cloud(), tumour(centre))
     assert str(error.value).startswith("tumour.centre = (")
     assert "move it" in str(error.value)
+
+
+def test_a_tumour_without_room_is_told_the_nearest_place_that_has_it(tmp_path):
+    path = save(tmp_path / "p.nii", *phantom())
+    for centre, what in (((0.003, 0.032, 0.007), "skull"), ((-0.0125, -0.005, 0.007), "left ventricle")):
+        with pytest.raises(
+            InputError, match=rf"from the {what}'s hexahedra, .* need 6 mm; move it \(the near"
+        ) as error:
+            mesh_labels(labels_of(path), deck.Cloud(), tumour(centre))
+        told = re.search(r"has it is \((.*)\) mm\)", str(error.value))[1]
+        nearest = tuple(float(x) / 1e3 for x in told.split(","))
+        assert 0 < np.linalg.norm(np.subtract(nearest, centre)) < 0.015
+        mesh_labels(labels_of(path), deck.Cloud(), tumour(nearest))
+
+
+def test_an_image_may_have_more_axes_than_it_needs_and_has_to_say_where_it_is(tmp_path):
+    data, affine = phantom()
+    same = mesh_labels(labels_of(save(tmp_path / "p.nii", data, affine), 0.0009), deck.Cloud(), None)
+    assert any("element_size = 0.9 mm: is smaller than a voxel" in remark for remark in same.remarks)
+    nibabel.save(nibabel.Nifti1Image(data[..., None], None), tmp_path / "nowhere.nii")
+    mesh = mesh_labels(labels_of(tmp_path / "nowhere.nii"), deck.Cloud(), None)
+    assert any("does not say where its voxels are" in remark for remark in mesh.remarks)
 
 
 def test_a_centre_in_voxels_is_told_in_millimetres(tmp_path):

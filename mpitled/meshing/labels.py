@@ -44,6 +44,7 @@ class Image:
     origin: NDArray[np.float64]  # (3,), m: the first voxel's lowest corner
     voxel: NDArray[np.float64]  # (3,), m: its edges along x, y, z
     to_world: NDArray[np.float64]  # (3, 4), m: of the file's own voxel indices and a last 1
+    placed: bool  # whether the header says how its voxels lie in the world
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +104,7 @@ def mesh_labels(
     integration_points, integration_volumes, surface_areas = np.empty((0, 3)), np.empty(0), None
     parts: tuple[Part, ...] = ()
     if tumour is not None:
-        void = _void(head, cloud.radius, np.asarray(tumour.centre, float))
+        void = _void(head, cloud.radius, np.asarray(tumour.centre, float), tumour.seed_radius + head.grid.size)
         filling = fill_void(points, hexahedra, void[head.solid], cloud, tumour, head.grid.size, spheres)
         points, hexahedra, n_fe_nodes = filling.points, filling.hexahedra, filling.n_fe_nodes
         integration_points, integration_volumes = filling.integration_points, filling.integration_volumes
@@ -148,6 +149,16 @@ def label_cells(labels: deck.Labels) -> Head:
     voxels = {name: mask & body for name, mask in voxels.items() if name in VENTRICLES}
 
     size = labels.element_size
+    if size < image.voxel.min():
+        remarks.append(
+            f"warning: labels.element_size = {1e3 * size:g} mm: is smaller than a voxel of {image.path}, "
+            f"{1e3 * image.voxel.min():.3g} mm, beyond which an image has no more to tell"
+        )
+    if not image.placed:
+        remarks.append(
+            f"warning: {image.path}: its header does not say where its voxels are, so which side is left is taken for "
+            "granted"
+        )
     n_cubes = float(body.sum() * (image.voxel / size).prod())
     check_size(n_cubes, f"labels.element_size = {1e3 * size:g} mm", "enlarge it")
     grid = _grid(image, body, size)
@@ -185,6 +196,9 @@ def read_image(path: Path) -> Image:
     try:
         _check_start(path)
         image: Any = nibabel.load(path)
+        placed = any(int(image.header.get(name, 1)) for name in ("qform_code", "sform_code"))  # of NIfTI alone
+        if len(image.shape) > 3 and set(image.shape[3:]) == {1}:  # one volume, with more axes than it needs
+            image = nibabel.funcs.squeeze_image(image)
         if len(image.shape) != 3 or 0 in image.shape:
             raise InputError(f"{path}: has shape {image.shape}, not three dimensions; give one volume of labels")
         _check_claim(path, image)
@@ -206,8 +220,9 @@ def read_image(path: Path) -> Image:
     tilt = np.abs(axes - np.diag(edges)) * np.array(data.shape)
     if not (edges > 0).all() or tilt.max() > 0.5 * edges.min():
         raise InputError(
-            f"{path}: its axes are oblique to the scanner's; resample it first, without interpolating the labels "
-            "(nibabel.processing.resample_to_output, order=0)"
+            f"{path}: its axes are oblique to the scanner's; resample it first, without interpolating the labels: "
+            f'python -c "import nibabel as n, nibabel.processing as p; '
+            f"n.save(p.resample_to_output(n.load('{path}'), order=0), 'straight.nii.gz')\""
         )
     try:
         metre = _METRES[getattr(image.header, "get_xyzt_units", lambda: ("mm",))()[0]]
@@ -219,6 +234,7 @@ def read_image(path: Path) -> Image:
         origin=(corner - edges / 2) * metre,
         voxel=edges * metre,
         to_world=to_world * metre,
+        placed=placed,
     )
 
 
@@ -435,27 +451,39 @@ def _connected_part(share: NDArray[np.float64], target: int) -> Cells:
     return part
 
 
-def _distance(grid: Grid, cells: Cells, place: NDArray[np.float64]) -> str:
-    """How far a place (3,), m, is from the nearest of the cubes, in mm."""
+def _distance(grid: Grid, cells: Cells, place: NDArray[np.float64]) -> float:
+    """How far a place (3,), m, is from the nearest of the cubes, m."""
     low = grid.origin + grid.size * np.argwhere(cells)[:, ::-1]
     apart = np.maximum(np.maximum(low - place, place - low - grid.size), 0.0)
-    return length(float(np.linalg.norm(apart, axis=1).min()))
+    return float(np.linalg.norm(apart, axis=1).min(initial=np.inf))
 
 
-def _void(head: Head, radius: float, centre: NDArray[np.float64]) -> Cells:
+def _elsewhere(grid: Grid, free: Cells, centre: NDArray[np.float64], needed: float) -> str:
+    """Where the nearest place is that has nothing but free cubes within so many metres, in words."""
+    # From middle to middle of cubes; half a diagonal is what a place may be nearer to the next cube's corner.
+    far = grid.size * (ndimage.distance_transform_edt(free) - 3**0.5 / 2)
+    middles = grid.origin + grid.size * (np.argwhere(far >= needed)[:, ::-1] + 0.5)
+    if not len(middles):
+        return "no place in this head has it"
+    return f"the nearest place that has it is {in_millimetres(middles[((middles - centre) ** 2).sum(axis=1).argmin()])}"
+
+
+def _void(head: Head, radius: float, centre: NDArray[np.float64], needed: float) -> Cells:
     """Cubes of tissue within the radius of the tumour's centre that make room for the cloud: one piece around it.
 
-    No cube with a node on the skull is among them, and what remains of the solid is one piece.
+    No cube with a node on the skull is among them, and what remains of the solid is one piece. InputError if the centre
+    is not in tissue, or one that must stay is nearer than `needed`.
     """
     where = f"tumour.centre = {in_millimetres(centre)}"
     grid, parts = head.grid, head.parts
-    ends = (grid.origin, grid.origin + grid.size * np.array(grid.shape))
+    at = np.argwhere(head.solid)[:, ::-1]
+    ends = (grid.origin + grid.size * at.min(axis=0), grid.origin + grid.size * (at.max(axis=0) + 1))
     hint = f"; {said}" if (said := looks_like_metres(centre, *ends)) else ""
     cell = grid.cell_of(centre)
     part = next((name for name, cells in parts.items() if cell is not None and cells[cell]), None)
     if part != "tissue":
         lies = f"in the {part.replace('_', ' ')}" if part else "outside the brain"
-        apart = _distance(grid, parts["tissue"], centre)
+        apart = length(_distance(grid, parts["tissue"], centre))
         extent = ", ".join(f"{name} {1e3 * a:.0f} to {1e3 * b:.0f}" for name, a, b in zip("xyz", *ends, strict=True))
         as_voxels = head.to_world @ np.append(1e3 * centre, 1.0)
         meant = grid.cell_of(as_voxels) if part is None else None
@@ -467,6 +495,16 @@ def _void(head: Head, radius: float, centre: NDArray[np.float64]) -> Cells:
     away = [(grid.origin[i] + grid.size * (np.arange(grid.shape[i]) + 0.5) - centre[i]) ** 2 for i in (2, 1, 0)]
     square_distance = away[0][:, None, None] + away[1][:, None] + away[2]
     free = parts["tissue"] & head.deep
+    stay = {name.replace("_", " "): parts[name] for name in VENTRICLES if name in parts}
+    stay["skull"] = parts["tissue"] & ~head.deep
+    apart_from = {name: _distance(grid, cells, centre) for name, cells in stay.items()}
+    nearest = min(apart_from, key=apart_from.__getitem__)
+    if apart_from[nearest] < needed:
+        raise InputError(
+            f"{where}: is {length(apart_from[nearest])} from the {nearest}'s hexahedra, and the seed and an element's "
+            f"size of cloud around it need {length(needed)}; move it ({_elsewhere(grid, free, centre, needed)}), or "
+            f"make the hexahedra smaller{hint}"
+        )
     void = free & (square_distance <= radius**2)
     while void[cell]:
         void = _piece(void, cell)
@@ -482,4 +520,6 @@ def _void(head: Head, radius: float, centre: NDArray[np.float64]) -> Cells:
         # One that must stay grows on the side away from the tumour until it is tied to the rest.
         beyond = square_distance > square_distance[held].mean()
         void &= ~(ndimage.binary_dilation(held) & beyond)
-    raise InputError(f"{where}: there is no room for a cloud so near to the skull or a ventricle; move it{hint}")
+    raise InputError(
+        f"{where}: there is no room for a cloud so near to the skull or a ventricle; move it away from there{hint}"
+    )
