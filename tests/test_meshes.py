@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import resource
 import subprocess
 import sys
@@ -192,14 +193,24 @@ def test_constraints_and_materials_of_the_files_count_with_those_of_the_deck(voi
     model = build(load_deck(scene))
     skull = model.node_sets["skull"]
     np.testing.assert_array_equal(model.prescribed_dofs, (3 * skull[:, None] + np.arange(3)).ravel())
-    edit(scene, "displacement = [0.0]", "displacement = [1.0]")
-    with pytest.raises(
-        InputError, match=r"fe.inp: line \d+.*mm in x.*through .*displaced.0.*|displaced.0.*fe.inp: line"
-    ):
-        build(load_deck(scene))
-    edit(scene, "displacement = [1.0]", "displacement = [0.0]")
+    assert not any(" replaces what " in remark for remark in model.remarks)
     edit(scene, 'nodes = "skull"', 'nodes = "scull"')
     with pytest.raises(InputError, match="no set 'scull'; sets: interface, skull"):
+        build(load_deck(scene))
+
+
+def test_a_deck_replaces_what_the_files_prescribe_where_it_names_dofs(void):
+    """The file holds the skull in x, y and z; the deck moves it along x, for which one remark is enough."""
+    scene = void / "scene.toml"
+    edit(scene, "displacement = [0.0]", "displacement = [1.0]")
+    model = build(load_deck(scene))
+    np.testing.assert_array_equal(model.prescribed_displacements, np.tile([1e-3, 0, 0], len(model.node_sets["skull"])))
+    said = [remark for remark in model.remarks if " replaces what " in remark]
+    n = len(model.node_sets["skull"])
+    assert said == [f"{scene}: displaced.0 replaces what {void / 'fe.inp'} prescribes at {n} nodes"]
+    twice = scene.read_text() + '[[fixed]]\nnodes = "skull"\n'
+    scene.write_text(twice)
+    with pytest.raises(InputError, match=r"displaced\.0.* moved by 1 mm in x, and by 0 mm through .*fixed\.0"):
         build(load_deck(scene))
 
 
@@ -413,6 +424,26 @@ def test_a_changed_include_builds_the_model_anew(tmp_path):
 
 
 # ------------------------------------------------------------ all together
+
+
+def test_a_load_that_is_not_applied_is_a_warning_of_the_result(tmp_path):
+    """Said once before the run, once at its end, by -q too, and at the top of the page."""
+    (tmp_path / "fe.inp").write_text(FLAT.replace("*END STEP", "*DSLOAD\n top, P, 1.\n*END STEP"))
+    (tmp_path / "scene.toml").write_text(
+        '[mesh]\nfe = "fe.inp"\nunit = "mm"\nstress_unit = "MPa"\n[solver]\nmethod = "quasi-static"\nload_time = 0.01\n'
+    )
+    told = f"{tmp_path / 'fe.inp'}: line 39: *DSLOAD is not applied, as no load is"
+    done = mpitled("run", tmp_path / "scene.toml", "--out", tmp_path / "out")
+    assert [line for line in done.stderr.splitlines() if "DSLOAD" in line] == [f"warning: {told}"]
+    assert [line.strip() for line in done.stdout.splitlines() if "DSLOAD" in line] == [f"warning: {told}"]
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["warnings"] == [told]
+    quietly = mpitled("run", tmp_path / "scene.toml", "-q", "--out", tmp_path / "out").stderr
+    assert quietly == f"mpitled: warning: {told}\n"
+    mpitled("report", tmp_path / "out", "--html")
+    top, _, below = (tmp_path / "out" / "report.html").read_text().partition("<h2>")
+    assert "DSLOAD" in top
+    assert "DSLOAD" not in below
 
 
 @pytest.mark.study

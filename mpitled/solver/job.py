@@ -12,6 +12,7 @@ from mpitled import deck as decks
 from mpitled import store
 from mpitled.deck import Deck
 from mpitled.errors import InputError, MpitledError, everywhere
+from mpitled.model import WARNING
 from mpitled.solver import checkpoint
 from mpitled.solver.halo import World
 from mpitled.solver.progress import Interrupts, Phases
@@ -139,7 +140,7 @@ def prepare(
         path = world.on_leader(lambda: build(deck, directory, quiet)[0])
     if world.leads and not quiet:
         for remark in store.read_remarks(path):
-            print(f"note: {remark}", file=sys.stderr, flush=True)
+            print(remark if remark.startswith(WARNING) else f"note: {remark}", file=sys.stderr, flush=True)
     with phases("partition"):
         if world.size > 1:
             world.on_leader(lambda: ensure_partition(path, world.size, deck.partition.seed, quiet))
