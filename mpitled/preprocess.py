@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from mpitled.deck import Deck, Sphere
 from mpitled.errors import InputError
 from mpitled.loading import growth, sphere_radius, turn
 from mpitled.material import Material
-from mpitled.mesh import Mesh, Part, named_set
+from mpitled.mesh import Constraint, Mesh, Part, named_set
 from mpitled.meshing import block, checks, labels, phantoms
 from mpitled.meshing.cloud import in_millimetres, in_sphere, length, looks_like_metres
 from mpitled.meshing.mapping import carry_over
@@ -104,7 +105,7 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
     n_fe_nodes, points = mesh.n_fe_nodes, mesh.points
     shapes, gradients, condition = support.moving_least_squares(points[domains], at, options.basis, options.weight)
     field_domains, field_shapes = support.field_at_nodes(points, n_fe_nodes, at, domains, options.basis, options.weight)
-    dofs, displacements, turns = prescribe(deck, mesh)
+    (dofs, displacements, turns, _), replaced = prescribe(deck, mesh)
     _check_growth(deck, mesh, dofs, displacements)
 
     fe_gradients, fe_volumes = hexahedra.geometry(points, mesh.hexahedra, deck.hexahedra.gradient)
@@ -160,6 +161,7 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
         figures=figures,
         remarks=(
             *mesh.remarks,
+            *replaced,
             *checks.scene_remarks(points, mesh.hexahedra, domains, n_fe_nodes, dofs),
             *_slips(deck, mesh, material, materials),
             *(_growth_remarks(deck) if len(domains) else ()),
@@ -426,13 +428,54 @@ def _without(orphans: NDArray[np.int64], mesh: Mesh, domains: NDArray[np.int64])
     return kept, number[domains]
 
 
-def prescribe(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Prescribed dofs (3 node + direction, ascending), their displacements (m) at full load, and their turns (n, 3).
+class Prescribed(NamedTuple):
+    """What is held or moved, and where it is said."""
 
-    InputError if a dof is asked to be in two places, or nothing at all is prescribed.
+    dofs: NDArray[np.int64]  # (n,), 3 node + direction, ascending
+    displacements: NDArray[np.float64]  # (n,), m at full load
+    turns: NDArray[np.float64]  # (n, 3), see `loading.turn`
+    origins: NDArray[np.object_]  # (n,), file and line or key
+
+
+def prescribe(deck: Deck, mesh: Mesh) -> tuple[Prescribed, list[str]]:
+    """What deck and mesh prescribe, and remarks on what the deck replaces of what its mesh files prescribe.
+
+    InputError if the deck asks a dof to be in two places, or its files do, or nothing at all is prescribed.
     """
-    dofs, values, turns, origins = [], [], [], []
-    for constraint in (*deck.constraints(), *mesh.constraints):
+    of_deck = _motions(mesh, deck.constraints())
+    if deck.tumour:
+        origin = f"{deck.path}: tumour"
+        nodes = named_set(mesh.node_sets, TUMOUR, origin)
+        moved = growth(mesh.points[nodes], np.array(deck.tumour.centre), deck.tumour.seed_radius, deck.tumour.volume)
+        of_deck.extend((3 * nodes + i, moved[:, i], np.zeros((len(nodes), 3)), origin) for i in range(3))
+    of_files = _motions(mesh, mesh.constraints)
+    if not of_deck and not of_files:
+        raise InputError(f"{deck.path}: nothing is fixed, displaced or grows; add [[fixed]], [[displaced]] or [tumour]")
+    own, given = (_without_clashes(mesh, motions) for motions in (of_deck, of_files))
+    _, mine, other = np.intersect1d(own.dofs, given.dofs, assume_unique=True, return_indices=True)
+    changed = own.displacements[mine] != given.displacements[other]
+    replaced: dict[tuple[str, str], set[int]] = {}
+    for at, instead in zip(mine[changed], other[changed], strict=True):
+        key, file = own.origins[at].removesuffix(".nodes"), given.origins[instead].partition(": line ")[0]
+        replaced.setdefault((key, file), set()).add(int(own.dofs[at]) // 3)
+    remarks = [
+        f"{key} replaces what {file} prescribes at {len(nodes)} nodes" for (key, file), nodes in replaced.items()
+    ]
+    left = np.ones(len(given.dofs), bool)
+    left[other] = False
+    both = [np.concatenate([one, more[left]]) for one, more in zip(own, given, strict=True)]
+    order = np.argsort(both[0])
+    return Prescribed(*(values[order] for values in both)), remarks
+
+
+#: Dofs (n,), their displacements (n,) and turns (n, 3), and where that is said.
+_Motion = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], str]
+
+
+def _motions(mesh: Mesh, constraints: Iterable[Constraint]) -> list[_Motion]:
+    """Each constraint's motion, direction by direction."""
+    found: list[_Motion] = []
+    for constraint in constraints:
         nodes = named_set(mesh.node_sets, constraint.node_set, constraint.origin)
         turned, arcs = np.zeros((len(nodes), 3)), np.zeros((len(nodes), 3, 3))
         if constraint.rotation:
@@ -441,23 +484,20 @@ def prescribe(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.flo
             where = constraint.origin.removesuffix("nodes") + "field"
             turned = turned + carry_over(constraint.field, constraint.field_metre, mesh.points[nodes], where)
         for direction, displacement in zip(constraint.directions, constraint.displacement, strict=True):
-            dofs.append(3 * nodes + direction)
-            values.append(displacement + turned[:, direction])
-            turns.append(arcs[:, direction])
-            origins.append(constraint.origin)
-    if deck.tumour:
-        origin = f"{deck.path}: tumour"
-        nodes = named_set(mesh.node_sets, TUMOUR, origin)
-        moved = growth(mesh.points[nodes], np.array(deck.tumour.centre), deck.tumour.seed_radius, deck.tumour.volume)
-        dofs.append((3 * nodes[:, None] + np.arange(3)).ravel())
-        values.append(moved.ravel())
-        turns.append(np.zeros((moved.size, 3)))
-        origins.append(origin)
-    if not dofs:
-        raise InputError(f"{deck.path}: nothing is fixed, displaced or grows; add [[fixed]], [[displaced]] or [tumour]")
-    every, at, source = np.concatenate(dofs), np.concatenate(values), np.repeat(np.arange(len(dofs)), [*map(len, dofs)])
+            moved = displacement + turned[:, direction]
+            found.append((3 * nodes + direction, moved, arcs[:, direction], constraint.origin))
+    return found
+
+
+def _without_clashes(mesh: Mesh, motions: list[_Motion]) -> Prescribed:
+    """All motions together, each dof once; InputError if one is to be in two places."""
+    origins = np.array([origin for *_, origin in motions], object)
+    every = np.concatenate([np.empty(0, np.int64), *(dofs for dofs, *_ in motions)])
+    at = np.concatenate([np.empty(0), *(moved for _, moved, *_ in motions)])
+    turning = np.concatenate([np.empty((0, 3)), *(turns for _, _, turns, _ in motions)])
+    source = np.repeat(np.arange(len(motions)), [len(dofs) for dofs, *_ in motions])
     order = np.lexsort((at, every))
-    every, at, source, turning = every[order], at[order], source[order], np.concatenate(turns)[order]
+    every, at, source, turning = every[order], at[order], source[order], turning[order]
     clash = np.flatnonzero((np.diff(every) == 0) & (np.diff(at) != 0))
     if len(clash):
         first = clash[0]
@@ -467,5 +507,5 @@ def prescribe(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.flo
             f"{'xyz'[every[first] % 3]}, and by {at[first] * 1e3:g} mm through {origins[source[first]]}; "
             f"take it out of one of the two ({len(clash)} such)"
         )
-    keep = np.append(True, np.diff(every) > 0)
-    return every[keep], at[keep], turning[keep]
+    keep = np.append(True, np.diff(every) > 0)[: len(every)]
+    return Prescribed(every[keep], at[keep], turning[keep], origins[source[keep]])

@@ -169,7 +169,7 @@ def _file_checks(file: MeshFile) -> Iterator[str]:
         section = MeshFiles(fe=file.path)
         mesh = meshes.assemble(section, file, None)
         deck = Deck(mesh=section, path=file.path)
-        dofs = preprocess.prescribe(deck, mesh)[0] if mesh.constraints else np.empty(0, np.int64)
+        dofs = preprocess.prescribe(deck, mesh)[0].dofs if mesh.constraints else np.empty(0, np.int64)
         yield from mesh.remarks
         none = np.empty((0, 8), np.int64)
         said = checks.scene_remarks(mesh.points, mesh.hexahedra, none, mesh.n_fe_nodes, dofs)
