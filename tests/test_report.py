@@ -286,7 +286,7 @@ def test_unfinished_results_without_figures(tmp_path):
         writer.write_frame(time, values, {"J": np.ones(model.n_cells)})
     writer.abandon({"min_jacobian": float("nan"), "peak_memory_bytes": [1, 2]})
     printed = mpitled("report", tmp_path).stdout
-    assert "not complete: 25.0% of the load time" in printed
+    assert "not complete: the last frame is at 25.0% of the load\n" in printed
     assert "smallest J" not in printed
     made = strictly(tmp_path / "report.json")
     assert not made["complete"]

@@ -27,9 +27,9 @@ class Watch:
 
     LASTING = Kept(alike=("figures", "largest_kinetic_ratio", "largest_energy"))
 
-    def __init__(self, world: World, sub: Subdomain, volume: float, remedy: str) -> None:
-        """volume: of the whole model, m^3; remedy: of instability."""
-        self.world, self.sub, self.remedy = world, sub, remedy
+    def __init__(self, world: World, sub: Subdomain, volume: float, scene: str, remedy: str) -> None:
+        """volume: of the whole model, m^3; scene: the deck's name; remedy: of instability."""
+        self.world, self.sub, self.scene, self.remedy = world, sub, scene, remedy
         self.figures: dict[str, float] = {}  # of all ranks, at the last look
         self.own_energy = 0.0  # J, in this rank's cells
         self.largest_kinetic_ratio = 0.0
@@ -57,7 +57,11 @@ class Watch:
         figures["kinetic_ratio"] = figures["kinetic"] / internal if internal > 0 else 0.0
         self.figures, self.request = figures, int(table[:, -1].max())
         finite = math.isfinite(internal + figures["kinetic"] + figures["external"])
-        if not finite or figures["min_jacobian"] <= 0:
+        where = f"unstable at {state.share:.1%} of the load of {self.scene}"
+        smallest = figures["min_jacobian"]  # J that are not a number count for nothing here, but make energies such
+        if not math.isfinite(smallest) or (smallest > 0 and not finite):  # no cell is the worst
+            raise UnstableError(f"{where}: displacements grew without bound (diverged); {self.remedy}")
+        if smallest <= 0:
             reason = "a cell is turned inside out"
         elif balance > BALANCE_LIMIT * largest + self._noise and state.step >= LEDGER_STARTS:
             reason = (
@@ -69,17 +73,17 @@ class Watch:
             if state.share >= 0.1:
                 self.largest_kinetic_ratio = max(self.largest_kinetic_ratio, figures["kinetic_ratio"])
             return
-        worst = int(np.argmin(np.where(np.isnan(columns["min_jacobian"]), -np.inf, columns["min_jacobian"])))
+        worst = int(np.argmin(columns["min_jacobian"]))
         cell = world.broadcast(self._worst_cell(method) if world.rank == worst else None, worst)
         raise UnstableError(
-            f"unstable at {state.share:.1%} of the load: {reason}; {cell}; the step is "
-            f"{figures['step_ratio']:.2f} of the longest stable one; {self.remedy}"
+            f"{where}: {reason}; {cell}; the step is {figures['step_ratio']:.2f} of the longest stable one; "
+            f"{self.remedy}"
         )
 
     def _worst_cell(self, method: March | Relaxation) -> str:
         """What and where the cell with the smallest J on this rank is, in a few words."""
         rows, jacobian, state = self.sub.rows, method.survey.jacobian[:-1], method.state
-        cell = int(np.argmin(np.where(np.isnan(jacobian), -np.inf, jacobian)))
+        cell = int(np.argmin(jacobian))
         hexahedron = cell < rows.n_own_hexahedra
         kind, k = ("hexahedra", cell) if hexahedron else ("domains", cell - rows.n_own_hexahedra)
         local = rows.local(rows.read(kind, k, k + 1)[0])
