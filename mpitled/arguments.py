@@ -141,7 +141,9 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
     predict.add_argument("--fixed", type=float, metavar="US", help="microseconds of a step that depend on no size (15)")
     predict.add_argument("--out", type=Path, metavar="DIR", help="folder of predict.csv and predict.png (the model's)")
 
-    export = command("export", "write a model as decks that run to the same result, here or elsewhere")
+    export = command(
+        "export", "write a model as decks that run to the same result here, and elsewhere if volumes change little"
+    )
     _model(export)
     export.add_argument("--abaqus", action="store_true", required=True, help="as Abaqus decks and a CSV table")
     export.add_argument("--out", type=Path, metavar="DIR", help="folder of the decks (export beside the model)")

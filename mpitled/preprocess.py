@@ -357,15 +357,13 @@ def _shared(
 def _materials(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int16], tuple[Material, ...]]:
     """Material of each cell, and the materials: those that the deck names first, then those of the mesh's own file.
 
-    "all" fills what no other set of the deck claims; what the deck leaves over is of the file's materials. Ventricles
+    "all" fills what no other set of the deck claims; what the deck leaves over is of the file's materials, of which
+    the others are none of the model's. Ventricles
     of which the deck says that there are none need no material, and may have one.
     """
     absent = {name for name in labels.VENTRICLES if deck.labels and not getattr(deck.labels, name)}
     claims = [(name, section.material) for section in deck.materials for name in section.cells if name not in absent]
-    of_file = list(mesh.materials.items())
-    if any(name == "all" for name, _ in claims):
-        of_file = []
-    materials = tuple(dict.fromkeys(material for _, material in (*claims, *of_file)))
+    materials = list(dict.fromkeys(material for _, material in claims))
     chosen = np.full(mesh.n_cells, -1, np.int16)
 
     def fill(name: str, material: Material, origin: str, open_cells: NDArray[np.bool_]) -> None:
@@ -384,6 +382,8 @@ def _materials(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int16], tuple[Materia
         open_cells = chosen < 0 if name == "all" else np.ones(mesh.n_cells, bool)
         fill(name, material, f"{deck.path}: material.{material.name}.cells", open_cells)
     left = chosen < 0
+    of_file = [(name, material) for name, material in mesh.materials.items() if left[mesh.cell_sets[name]].any()]
+    materials += [material for material in dict.fromkeys(m for _, m in of_file) if material not in materials]
     for name, material in of_file:
         fill(name, material, f"{deck.path}: mesh: section of material {material.name}", left)
     if (chosen < 0).any():
@@ -393,7 +393,7 @@ def _materials(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int16], tuple[Materia
             f"{deck.path}: material: {np.count_nonzero(chosen < 0)} cells have none, the first in "
             f"{' and '.join(sets) or 'no set'}; name their set in a material's cells"
         )
-    return chosen, materials
+    return chosen, tuple(materials)
 
 
 def _without(orphans: NDArray[np.int64], mesh: Mesh, domains: NDArray[np.int64]) -> tuple[Mesh, NDArray[np.int64]]:

@@ -201,6 +201,8 @@ def test_later_steps_take_nodes_over(tmp_path):
     assert at[35, 0] == {0.25}
     assert at[10, 0] == {-0.5}
     assert at[10, 1] == {0.0}
+    assert any("several steps; those at the end count" in remark for remark in file.remarks)
+    assert not any("several steps" in remark for remark in read(tmp_path, FLAT).remarks)  # held first, then moved
     new = read(tmp_path, FLAT + more.replace("*BOUNDARY", "*BOUNDARY, OP=NEW"))
     assert {c.displacement for c in new.constraints} == {(0.5,), (-0.5,)}
 

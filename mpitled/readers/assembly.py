@@ -340,14 +340,13 @@ class Model:
 
     def _constrain(self, names: dict[tuple[str, str, str], str]) -> None:
         """The boundary conditions at the end of the last step: later steps take nodes over from earlier ones."""
-        if len({step for step, _ in self.given.boundaries}) > 1:
-            self.remarks.append(f"{self.mesh.path}: boundary conditions of several steps; those at the end count")
         constraints: list[tuple[int, Constraint, NDArray[np.int64]]] = []
         for step, keyword in self.given.boundaries:
             constraints += [(step, *found) for found in self._boundary(names, keyword)]
         claimed = np.zeros((len(self.mesh.points), 3), bool)
         last = max((step for step, _, _ in constraints), default=0)
         kept: list[Constraint] = []
+        taken_over = False
         for step in range(last, -1, -1):
             of_step = [(constraint, nodes) for at, constraint, nodes in constraints if at == step]
             for constraint, nodes in of_step:
@@ -355,6 +354,7 @@ class Model:
                 if free.all():
                     kept.append(constraint)
                     continue
+                taken_over = True
                 for i, direction in enumerate(constraint.directions):
                     if free[:, i].any():
                         rest = nodes[free[:, i]]
@@ -365,6 +365,8 @@ class Model:
                         kept.append(Constraint(name, (direction,), (values,), constraint.origin))
             for constraint, nodes in of_step:
                 claimed[nodes[:, None], constraint.directions] = True
+        if taken_over:
+            self.remarks.append(f"{self.mesh.path}: boundary conditions of several steps; those at the end count")
         self.mesh.constraints = kept
 
     def _boundary(
