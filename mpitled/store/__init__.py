@@ -8,7 +8,7 @@ from mpitled.store.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from mpitled.store.columns import read_grid, write_columns
+from mpitled.store.columns import read_grid, table_contents, write_columns
 from mpitled.store.files import check_hdf5, has_mpi, hdf5_version, read_rows
 from mpitled.store.models import (
     MODEL_ARRAYS,
@@ -71,6 +71,7 @@ __all__ = [
     "read_scene",
     "read_sets",
     "result_bytes",
+    "table_contents",
     "unfinished_bytes",
     "write_checkpoint",
     "write_columns",
