@@ -33,12 +33,13 @@ from mpitled.store.partitions import (
     read_part,
     write_partition,
 )
-from mpitled.store.results import Result, is_finished, is_result, is_unfinished, open_result, unfinished_bytes
+from mpitled.store.results import EFG_NODE, Result, is_finished, is_result, is_unfinished, open_result, unfinished_bytes
 from mpitled.store.writer import ResultWriter, result_bytes
 
 __all__ = [
     "BLOCK",
     "CHECKPOINTS",
+    "EFG_NODE",
     "MODEL_ARRAYS",
     "PartRows",
     "Result",
