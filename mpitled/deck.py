@@ -34,7 +34,7 @@ _FINEST = 1e-30
 _TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"?|\'[^\'\n]*\'?|[\w-]+|[ \t]+|.', re.DOTALL)
 _DECIMAL_COMMA = re.compile(r"=\s*[-+]?\d+,\d+\s*(#|$)")
 #: Names that meshes have, and decks never.
-_OF_MESHES = (".inp", ".k", ".key", ".dyn", ".msh", ".vtk", ".vtu")
+OF_MESHES = (".inp", ".k", ".key", ".dyn", ".msh", ".vtk", ".vtu", ".med", ".xdmf", ".mesh", ".bdf")
 #: Units of the deck that are not SI: how many make one SI unit. Dividing by a power of ten rounds 5.1 mm to 0.0051 m.
 _PER_SI = {"mm": 1e3, "mm3": 1e9, "degrees": 180 / math.pi}
 
@@ -397,7 +397,7 @@ def _parse(path: Path) -> dict[str, Any]:
             content = file.read(_MOST_BYTES + 1)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}; give the path of a deck (TOML)") from None
-    if path.suffix.lower() in _OF_MESHES:
+    if path.suffix.lower() in OF_MESHES:
         what = f'is a mesh; check it by: mpitled check {path}; a deck computes it by: [mesh] fe = "{path.name}"'
         raise InputError(f"{path}: {what}")
     try:

@@ -12,16 +12,6 @@ from typing import Any, NamedTuple
 from mpitled import __version__
 from mpitled.errors import InputError, damaged
 
-#: What files of other kinds are, by the end of their name, and where to turn with them.
-_ELSEWHERE = {
-    (".toml",): "is a deck: mpitled check {path}",
-    (".inp", ".k", ".key", ".dyn", ".vtu", ".vtk", ".msh", ".med", ".xdmf", ".mesh", ".bdf", ".e"): (
-        "is a mesh: mpitled check {path}"
-    ),
-    ("report.json",): "is the report of a run: mpitled report {path.parent}",
-    (".csv", ".md"): "is a table of text; open it in an editor or a spreadsheet",
-    (".png", ".html"): "is there to be looked at; open it in a viewer or a browser",
-}
 _MOST_LABELS = 200  # that are shown, a line each
 _SETUP = "bash jobs/brain.sh sets it up, or see jobs/environment.sh"
 
@@ -68,11 +58,23 @@ def contents(path: Path) -> dict[str, Any]:
 
     if labels.is_image(path):
         return {"kind": "image", "path": str(path), **labels.contents(path)}
-    for ends, what in _ELSEWHERE.items() if path.is_file() else ():
-        if path.name.lower().endswith(ends):
-            raise InputError(f"{path}: {what.format(path=path)}")
+    if path.is_file() and (what := _elsewhere(path)):
+        raise InputError(f"{path}: {what}")
     with damaged(path, "build the model anew, or run the deck again"):
         return _contents(path)
+
+
+def _elsewhere(path: Path) -> str:
+    """What a file is that is read by another command or program, by its name, and where to turn; else nothing."""
+    from mpitled.deck import OF_MESHES
+
+    if path.name == "report.json":
+        return f"is the report of a run: mpitled report {path.parent}"
+    of_others = {".toml": f"is a deck: mpitled check {path}"}
+    of_others |= dict.fromkeys(OF_MESHES, f"is a mesh: mpitled check {path}")
+    of_others |= dict.fromkeys((".csv", ".md"), "is a table of text; open it in an editor or a spreadsheet")
+    of_others |= dict.fromkeys((".png", ".html"), "is there to be looked at; open it in a viewer or a browser")
+    return of_others.get(path.suffix.lower(), "")
 
 
 def _contents(path: Path) -> dict[str, Any]:

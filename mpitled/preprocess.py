@@ -180,8 +180,8 @@ def _check_growth(deck: Deck, mesh: Mesh, dofs: NDArray[np.int64], displacements
     radius, room = sphere_radius(deck.tumour.volume), float(distances.min(initial=np.inf))
     if radius > room:
         raise InputError(
-            f"{deck.path}: tumour.volume = {1e9 * deck.tumour.volume:g}: its sphere of {length(radius)} radius reaches "
-            f"beyond the outer surface, which is fixed {length(room)} from tumour.centre; lower it"
+            f"{deck.path}: tumour.volume = {1e9 * deck.tumour.volume:.10g}: its sphere of {length(radius)} radius "
+            f"reaches beyond the outer surface, which is fixed {length(room)} from tumour.centre; lower it"
         )
 
 
@@ -192,9 +192,9 @@ def _slips(deck: Deck, mesh: Mesh, material: NDArray[np.int16], materials: tuple
         name, modulus = f"material.{section.name}", section.youngs_modulus
         if not 1 <= modulus <= 1e12:
             told.add(section.name)
-            yield f"warning: {name}.youngs_modulus = {modulus:g}: is it in Pa? Brain tissue has about 3000"
+            yield f"warning: {name}.youngs_modulus = {modulus:.10g}: is it in Pa? Brain tissue has about 3000"
         if not 100 <= section.density <= 25000:
-            yield f"warning: {name}.density = {section.density:g}: is it in kg/m3? Tissue has about 1000"
+            yield f"warning: {name}.density = {section.density:.10g}: is it in kg/m3? Tissue has about 1000"
     if deck.tumour is None:
         return
     centre = np.asarray(deck.tumour.centre)
@@ -205,7 +205,7 @@ def _slips(deck: Deck, mesh: Mesh, material: NDArray[np.int16], materials: tuple
     middles = np.concatenate([of_hexahedra, mesh.integration_points])
     grows_in = materials[material[((middles - centre) ** 2).sum(axis=1).argmin()]]
     if grows_in.youngs_modulus < SOFTEST and grows_in.name not in told:
-        what = f"material.{grows_in.name}.youngs_modulus = {grows_in.youngs_modulus:g}"
+        what = f"material.{grows_in.name}.youngs_modulus = {grows_in.youngs_modulus:.10g}"
         yield f"warning: {what}: is softer than any tissue that a tumour grows in; moduli are in Pa"
 
 

@@ -166,6 +166,6 @@ def prepare(
 def ensure_partition(path: Path, n_parts: int, seed: int, quiet: bool = True) -> None:
     """Partition a model unless it is partitioned in as many parts."""
     if not store.has_partition(path, n_parts):
+        divide(path, n_parts, seed)
         if not quiet:
             print(f"note: the model is cut in {n_parts} parts", file=sys.stderr, flush=True)
-        divide(path, n_parts, seed)
