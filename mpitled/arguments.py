@@ -144,7 +144,9 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
     predict.add_argument("--fixed", type=float, metavar="US", help="microseconds of a step that depend on no size (15)")
     predict.add_argument("--out", type=Path, metavar="DIR", help="folder of predict.csv and predict.png (the model's)")
 
-    export = command("export", "write a model as decks that run to the same result, here or elsewhere")
+    export = command(
+        "export", "write a model as decks that run to the same result here, and elsewhere if volumes change little"
+    )
     _model(export)
     export.add_argument("--abaqus", action="store_true", required=True, help="as Abaqus decks and a CSV table")
     export.add_argument("--out", type=Path, metavar="DIR", help="folder of the decks (export beside the model)")
@@ -154,7 +156,7 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
         "file",
         type=Path,
         nargs="?",
-        help="model, result, checkpoint or label image: what it holds, and whether it is whole",
+        help="model, result, checkpoint, table or label image: what it holds, and whether it is whole",
     )
     return made
 

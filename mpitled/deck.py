@@ -34,7 +34,7 @@ _FINEST = 1e-30
 _TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"?|\'[^\'\n]*\'?|[\w-]+|[ \t]+|.', re.DOTALL)
 _DECIMAL_COMMA = re.compile(r"=\s*[-+]?\d+,\d+\s*(#|$)")
 #: Names that meshes have, and decks never.
-_OF_MESHES = (".inp", ".k", ".key", ".dyn", ".msh", ".vtk", ".vtu")
+OF_MESHES = (".inp", ".k", ".key", ".dyn", ".msh", ".vtk", ".vtu", ".med", ".xdmf", ".mesh", ".bdf")
 #: Units of the deck that are not SI: how many make one SI unit. Dividing by a power of ten rounds 5.1 mm to 0.0051 m.
 _PER_SI = {"mm": 1e3, "mm3": 1e9, "degrees": 180 / math.pi}
 
@@ -355,8 +355,8 @@ def _axes(section: Fixed | Displaced) -> tuple[int, ...]:
 # --- from TOML -----------------------------------------------------------------------------------------------------
 
 
-def load_deck(path: str | Path, overrides: Sequence[str] = (), varied: Sequence[str] = ()) -> Deck:
-    """The scene of a TOML file, changed by overrides "section.key=value"; all that is wrong with it is an InputError.
+def load_deck(path: str | Path, overrides: str | Sequence[str] = (), varied: Sequence[str] = ()) -> Deck:
+    """The scene of a TOML file, changed by one or more overrides "section.key=value"; InputError if anything is wrong.
 
     The right side of an override is a TOML value; quotes around a string may be left out. Entries of [[fixed]] and
     [[displaced]] count from 0: "fixed.0.nodes=skull". Files are relative to the deck's folder, also in overrides.
@@ -364,6 +364,7 @@ def load_deck(path: str | Path, overrides: Sequence[str] = (), varied: Sequence[
     """
     path = Path(path)
     table = _parse(path)
+    overrides = [overrides] if isinstance(overrides, str) else overrides
     given = [*(("--set", text) for text in overrides), *(("varied", text) for text in varied)]
     source = _Source(path, {_override(table, text, option): option for option, text in given})
     deck: Deck = _section(Deck, table, "", source, {"path": path})
@@ -397,7 +398,7 @@ def _parse(path: Path) -> dict[str, Any]:
             content = file.read(_MOST_BYTES + 1)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}; give the path of a deck (TOML)") from None
-    if path.suffix.lower() in _OF_MESHES:
+    if path.suffix.lower() in OF_MESHES:
         what = f'is a mesh; check it by: mpitled check {path}; a deck computes it by: [mesh] fe = "{path.name}"'
         raise InputError(f"{path}: {what}")
     try:

@@ -1,8 +1,11 @@
 """A model as decks: Abaqus files of the FE mesh and of the cloud, integration points as CSV, and the scene as TOML.
 
 Numbers are in SI units and the shortest decimals that are read as the same floats, in the model's order of nodes and
-cells: so what is read back is the same model, bit for bit. But for a cloud of several materials: the decks do not say
-whose its nodes are, and support domains made from them take nodes of all. The scene says so.
+cells: so what is read back by the scene is the same model, bit for bit. But for a cloud of several materials: the decks
+do not say whose its nodes are, and support domains made from them take nodes of all. The scene says so.
+
+Materials are neo-Hookean in the Abaqus files too, but not quite of the same law (see `_LAW`), and their C10 and D1 are
+E and nu but for round-off: the scene has these.
 """
 
 from __future__ import annotations
@@ -26,6 +29,12 @@ from mpitled.readers.meshfile import LARGEST_ID
 FE, EFG, GRID, AREAS, SCENE = "fe.inp", "efg.inp", "integration_points.csv", "surface_areas.csv", "scene.toml"
 #: Sections that the export writes anew: constraints and spheres are in the files, materials go by sets that there are.
 _IN_FILES = ("sphere", "material", "fixed", "displaced")
+#: *ELASTIC would be hypoelastic in a step with NLGEOM, which is farther from what is computed than this.
+_LAW = (
+    "** mpitled has the energy mu/2 (I1 - 3) - mu ln J + lambda/2 (J - 1)^2, and Abaqus\n"
+    "** C10 (J^(-2/3) I1 - 3) + (J - 1)^2/D1. With C10 = mu/2 and D1 = 2/(lambda + 2 mu/3)\n"
+    "** they agree for small strain and where J = 1, and differ in large changes of volume.\n"
+)
 _ROW = 16  # numbers in a line of a set
 _CHUNK = 1 << 16  # lines at once
 
@@ -125,7 +134,8 @@ def _fe(model: Model, ids: NDArray[np.int64]) -> Iterator[str]:
             if len(model.cell_sets[name]) and model.cell_sets[name][0] < n_cells:
                 yield f"*SOLID SECTION, ELSET={_quoted(name)}, MATERIAL={_quoted(material.name)}\n"
         yield f"*MATERIAL, NAME={_quoted(material.name)}\n*DENSITY\n{material.density!r}\n"
-        yield f"*ELASTIC\n{material.youngs_modulus!r}, {material.poissons_ratio!r}\n"
+        bulk = material.youngs_modulus / (3 * (1 - 2 * material.poissons_ratio))
+        yield f"{_LAW}*HYPERELASTIC, NEO HOOKE\n{material.mu / 2!r}, {2 / bulk!r}\n"
     yield from _boundary(model, ids, 0, n)
 
 

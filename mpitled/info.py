@@ -48,9 +48,9 @@ def versions() -> dict[str, str | None]:
 
 
 def contents(path: Path) -> dict[str, Any]:
-    """What a model, result, checkpoint or label image is and holds, as JSON can hold it, after all of it was read.
+    """What a model, result, checkpoint, table or label image is and holds, as JSON can hold it, after it was read.
 
-    InputError if it is none of these, or damaged.
+    InputError if it is none of these, or damaged. Of tables, which have no checksums, only the outlines are read.
     """
     if path.is_dir():
         raise InputError(f"{path}: is a folder; give a file in it, model.h5 or result.vtkhdf")
@@ -58,8 +58,23 @@ def contents(path: Path) -> dict[str, Any]:
 
     if labels.is_image(path):
         return {"kind": "image", "path": str(path), **labels.contents(path)}
+    if path.is_file() and (what := _elsewhere(path)):
+        raise InputError(f"{path}: {what}")
     with damaged(path, "build the model anew, or run the deck again"):
         return _contents(path)
+
+
+def _elsewhere(path: Path) -> str:
+    """What a file is that is read by another command or program, by its name, and where to turn; else nothing."""
+    from mpitled.deck import OF_MESHES
+
+    if path.name == "report.json":
+        return f"is the report of a run: mpitled report {path.parent}"
+    of_others = {".toml": f"is a deck: mpitled check {path}"}
+    of_others |= dict.fromkeys(OF_MESHES, f"is a mesh: mpitled check {path}")
+    of_others |= dict.fromkeys((".csv", ".md"), "is a table of text; open it in an editor or a spreadsheet")
+    of_others |= dict.fromkeys((".png", ".html"), "is there to be looked at; open it in a viewer or a browser")
+    return of_others.get(path.suffix.lower(), "")
 
 
 def _contents(path: Path) -> dict[str, Any]:
@@ -68,6 +83,8 @@ def _contents(path: Path) -> dict[str, Any]:
     if store.model_key(path) is not None:
         store.check_model(path)
         return {"kind": "model", "path": str(path), **store.model_contents(path)}
+    if tables := store.table_contents(path):
+        return {"kind": "table", "path": str(path), "tables": tables}
     if store.is_checkpoint(path):
         told = store.checkpoint_contents(path)
         names = ("version", "ranks", "step", "share", "frames")
@@ -75,15 +92,16 @@ def _contents(path: Path) -> dict[str, Any]:
     with store.open_result(path) as result:
         result.check()
         metadata, times = result.metadata, result.times
-        n_hexahedra = len(result.hexahedra)
+        n_hexahedra, last = len(result.hexahedra), float(times[-1]) if len(times) else 0.0
+        solver = metadata.get("deck", {}).get("solver", {})
+        relaxed = solver.get("method") == "dynamic-relaxation"  # whose times are shares of the load
         return {
             "kind": "result",
             "path": str(path),
             "complete": result.complete,
             "title": metadata["title"],
             "frames": result.n_frames,
-            "time_s": float(times[-1]) if len(times) else 0.0,
-            "load_time_s": metadata["load_time_s"],
+            **({"load_share": last} if relaxed else {"time_s": last, "load_time_s": metadata["load_time_s"]}),
             "nodes": len(result.at_nodes("node_id")),
             "hexahedra": n_hexahedra,
             "support_domains": len(result.in_cells("cell_id")) - n_hexahedra,
@@ -113,6 +131,11 @@ def describe(path: Path) -> str:
         if len(volumes) > _MOST_LABELS:
             lines.append(f"{len(volumes) - _MOST_LABELS} more; so many may be intensities, and no labels")
         return "\n".join(lines)
+    if has["kind"] == "table":
+        lines = [f"{path}: tables of mpitled"]
+        for name, told in has["tables"].items():
+            lines.append(f"{name:<16} {told['rows']} rows of {', '.join(told['columns'])}")
+        return "\n".join(lines)
     if has["kind"] == "checkpoint":
         lines = [
             f"{path}: a whole checkpoint of mpitled {has['version']}",
@@ -121,10 +144,14 @@ def describe(path: Path) -> str:
             f"ranks            {has['ranks']}",
         ]
         return "\n".join(lines)
+    if "load_share" in has:
+        reached = f"{has['load_share']:.1%} of the load"
+    else:
+        reached = f"{has['time_s']:g} s of {has['load_time_s']:g} s"
     lines = [
         f"{path}: {'a whole' if has['complete'] else 'an unfinished'} result of mpitled",
         f"title            {has['title']}",
-        f"frames           {has['frames']}, to {has['time_s']:g} s of {has['load_time_s']:g} s",
+        f"frames           {has['frames']}, to {reached}",
         f"nodes            {has['nodes']}",
         f"hexahedra        {has['hexahedra']}",
         f"support domains  {has['support_domains']}",

@@ -31,15 +31,18 @@ __all__ = ["Frames", "RunResult", "build_model", "load_deck", "open_result", "op
 _LARGEST = 1 << 30
 
 
-def build_model(deck: Deck) -> Model:
-    """The discrete model of a deck, in memory. InputError if the mesh and the deck do not fit each other."""
-    return preprocess.build(deck)
+def build_model(deck: Deck | str | Path, overrides: str | Sequence[str] = ()) -> Model:
+    """The discrete model of a deck, in memory. InputError if the mesh and the deck do not fit each other.
+
+    Overrides, "section.key=value", are for a deck that is given as a path.
+    """
+    return preprocess.build(_loaded(deck, overrides))
 
 
 def run_deck(
     deck: Deck | str | Path,
     directory: str | Path,
-    overrides: Sequence[str] = (),
+    overrides: str | Sequence[str] = (),
     *,
     quiet: bool = True,
     resume: bool = False,
@@ -50,11 +53,15 @@ def run_deck(
     Overrides, "section.key=value", are for a deck that is given as a path. InputError, UnstableError or
     InterruptedRun, alike on all ranks.
     """
+    return job.run(_loaded(deck, overrides), Path(directory), World(), quiet=quiet, resume=resume)
+
+
+def _loaded(deck: Deck | str | Path, overrides: str | Sequence[str]) -> Deck:
     if not isinstance(deck, Deck):
-        deck = load_deck(deck, overrides)
-    elif overrides:
+        return load_deck(deck, overrides)
+    if overrides:
         raise InputError("overrides: are for a deck given as a path; give them to load_deck")
-    return job.run(deck, Path(directory), World(), quiet=quiet, resume=resume)
+    return deck
 
 
 def open_result(path: str | Path) -> RunResult:
@@ -173,7 +180,13 @@ class RunResult:
             raise InputError(f"{path}: cannot be read ({error}); make it: mpitled report {path.parent}") from None
 
     def to_pyvista(self, frame: int = -1) -> Any:
-        """A frame as pyvista.UnstructuredGrid, undeformed, in metres: see `views.grid`."""
+        """A frame as pyvista.UnstructuredGrid, undeformed, in metres. InputError without PyVista.
+
+        Points are nodes and integration points, with "displacement" (m), the field's. Cells are hexahedra, and vertices
+        for the EFG nodes and, at their integration points, for the support domains: "kind" is 0, 1 and 2 of them. "J"
+        is that of hexahedra and domains, nan of EFG nodes, and "material" the number of their material in the deck,
+        from 0, or -1.
+        """
         return self._frames(lambda frame: views.grid(self._result, frame))[frame]
 
     def to_xarray(self) -> Any:

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from mpitled.material import Material
 
+#: How remarks begin that are warnings; the others are notes.
+WARNING = "warning: "
+
 
 @dataclass(frozen=True, slots=True)
 class Model:
@@ -38,7 +41,7 @@ class Model:
     cell_sets: dict[str, NDArray[np.int64]]
     surface_areas: NDArray[np.float64] | None = None  # (n_nodes, 3), m^2, as the mesh has them: for the export
     figures: dict[str, float] = field(default_factory=dict)
-    remarks: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()  # what building it skipped, merged, repaired or found odd, a line each
 
     @property
     def n_nodes(self) -> int:
@@ -47,3 +50,13 @@ class Model:
     @property
     def n_cells(self) -> int:
         return len(self.hexahedra) + len(self.domains)
+
+    @property
+    def warnings(self) -> list[str]:
+        """Remarks for which a result may not be what it seems, without the word."""
+        return [remark.removeprefix(WARNING) for remark in self.remarks if remark.startswith(WARNING)]
+
+    @property
+    def notes(self) -> list[str]:
+        """The other remarks."""
+        return [remark for remark in self.remarks if not remark.startswith(WARNING)]

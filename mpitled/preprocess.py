@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from mpitled.deck import Deck, Sphere
 from mpitled.errors import InputError
 from mpitled.loading import growth, sphere_radius, turn
 from mpitled.material import Material
-from mpitled.mesh import Mesh, Part, named_set
+from mpitled.mesh import Constraint, Mesh, Part, named_set
 from mpitled.meshing import block, checks, labels, phantoms
 from mpitled.meshing.cloud import in_millimetres, in_sphere, length, looks_like_metres
 from mpitled.meshing.mapping import carry_over
@@ -104,7 +105,7 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
     n_fe_nodes, points = mesh.n_fe_nodes, mesh.points
     shapes, gradients, condition = support.moving_least_squares(points[domains], at, options.basis, options.weight)
     field_domains, field_shapes = support.field_at_nodes(points, n_fe_nodes, at, domains, options.basis, options.weight)
-    dofs, displacements, turns = prescribe(deck, mesh)
+    (dofs, displacements, turns, _), replaced = prescribe(deck, mesh)
     _check_growth(deck, mesh, dofs, displacements)
 
     fe_gradients, fe_volumes = hexahedra.geometry(points, mesh.hexahedra, deck.hexahedra.gradient)
@@ -160,6 +161,7 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
         figures=figures,
         remarks=(
             *mesh.remarks,
+            *replaced,
             *checks.scene_remarks(points, mesh.hexahedra, domains, n_fe_nodes, dofs),
             *_slips(deck, mesh, material, materials),
             *(_growth_remarks(deck) if len(domains) else ()),
@@ -178,8 +180,8 @@ def _check_growth(deck: Deck, mesh: Mesh, dofs: NDArray[np.int64], displacements
     radius, room = sphere_radius(deck.tumour.volume), float(distances.min(initial=np.inf))
     if radius > room:
         raise InputError(
-            f"{deck.path}: tumour.volume = {1e9 * deck.tumour.volume:g}: its sphere of {length(radius)} radius reaches "
-            f"beyond the outer surface, which is fixed {length(room)} from tumour.centre; lower it"
+            f"{deck.path}: tumour.volume = {1e9 * deck.tumour.volume:.10g}: its sphere of {length(radius)} radius "
+            f"reaches beyond the outer surface, which is fixed {length(room)} from tumour.centre; lower it"
         )
 
 
@@ -190,9 +192,9 @@ def _slips(deck: Deck, mesh: Mesh, material: NDArray[np.int16], materials: tuple
         name, modulus = f"material.{section.name}", section.youngs_modulus
         if not 1 <= modulus <= 1e12:
             told.add(section.name)
-            yield f"warning: {name}.youngs_modulus = {modulus:g}: is it in Pa? Brain tissue has about 3000"
+            yield f"warning: {name}.youngs_modulus = {modulus:.10g}: is it in Pa? Brain tissue has about 3000"
         if not 100 <= section.density <= 25000:
-            yield f"warning: {name}.density = {section.density:g}: is it in kg/m3? Tissue has about 1000"
+            yield f"warning: {name}.density = {section.density:.10g}: is it in kg/m3? Tissue has about 1000"
     if deck.tumour is None:
         return
     centre = np.asarray(deck.tumour.centre)
@@ -203,7 +205,7 @@ def _slips(deck: Deck, mesh: Mesh, material: NDArray[np.int16], materials: tuple
     middles = np.concatenate([of_hexahedra, mesh.integration_points])
     grows_in = materials[material[((middles - centre) ** 2).sum(axis=1).argmin()]]
     if grows_in.youngs_modulus < SOFTEST and grows_in.name not in told:
-        what = f"material.{grows_in.name}.youngs_modulus = {grows_in.youngs_modulus:g}"
+        what = f"material.{grows_in.name}.youngs_modulus = {grows_in.youngs_modulus:.10g}"
         yield f"warning: {what}: is softer than any tissue that a tumour grows in; moduli are in Pa"
 
 
@@ -355,15 +357,13 @@ def _shared(
 def _materials(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int16], tuple[Material, ...]]:
     """Material of each cell, and the materials: those that the deck names first, then those of the mesh's own file.
 
-    "all" fills what no other set of the deck claims; what the deck leaves over is of the file's materials. Ventricles
+    "all" fills what no other set of the deck claims; what the deck leaves over is of the file's materials, of which
+    the others are none of the model's. Ventricles
     of which the deck says that there are none need no material, and may have one.
     """
     absent = {name for name in labels.VENTRICLES if deck.labels and not getattr(deck.labels, name)}
     claims = [(name, section.material) for section in deck.materials for name in section.cells if name not in absent]
-    of_file = list(mesh.materials.items())
-    if any(name == "all" for name, _ in claims):
-        of_file = []
-    materials = tuple(dict.fromkeys(material for _, material in (*claims, *of_file)))
+    materials = list(dict.fromkeys(material for _, material in claims))
     chosen = np.full(mesh.n_cells, -1, np.int16)
 
     def fill(name: str, material: Material, origin: str, open_cells: NDArray[np.bool_]) -> None:
@@ -382,6 +382,8 @@ def _materials(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int16], tuple[Materia
         open_cells = chosen < 0 if name == "all" else np.ones(mesh.n_cells, bool)
         fill(name, material, f"{deck.path}: material.{material.name}.cells", open_cells)
     left = chosen < 0
+    of_file = [(name, material) for name, material in mesh.materials.items() if left[mesh.cell_sets[name]].any()]
+    materials += [material for material in dict.fromkeys(m for _, m in of_file) if material not in materials]
     for name, material in of_file:
         fill(name, material, f"{deck.path}: mesh: section of material {material.name}", left)
     if (chosen < 0).any():
@@ -391,7 +393,7 @@ def _materials(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int16], tuple[Materia
             f"{deck.path}: material: {np.count_nonzero(chosen < 0)} cells have none, the first in "
             f"{' and '.join(sets) or 'no set'}; name their set in a material's cells"
         )
-    return chosen, materials
+    return chosen, tuple(materials)
 
 
 def _without(orphans: NDArray[np.int64], mesh: Mesh, domains: NDArray[np.int64]) -> tuple[Mesh, NDArray[np.int64]]:
@@ -426,13 +428,54 @@ def _without(orphans: NDArray[np.int64], mesh: Mesh, domains: NDArray[np.int64])
     return kept, number[domains]
 
 
-def prescribe(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Prescribed dofs (3 node + direction, ascending), their displacements (m) at full load, and their turns (n, 3).
+class Prescribed(NamedTuple):
+    """What is held or moved, and where it is said."""
 
-    InputError if a dof is asked to be in two places, or nothing at all is prescribed.
+    dofs: NDArray[np.int64]  # (n,), 3 node + direction, ascending
+    displacements: NDArray[np.float64]  # (n,), m at full load
+    turns: NDArray[np.float64]  # (n, 3), see `loading.turn`
+    origins: NDArray[np.object_]  # (n,), file and line or key
+
+
+def prescribe(deck: Deck, mesh: Mesh) -> tuple[Prescribed, list[str]]:
+    """What deck and mesh prescribe, and remarks on what the deck replaces of what its mesh files prescribe.
+
+    InputError if the deck asks a dof to be in two places, or its files do, or nothing at all is prescribed.
     """
-    dofs, values, turns, origins = [], [], [], []
-    for constraint in (*deck.constraints(), *mesh.constraints):
+    of_deck = _motions(mesh, deck.constraints())
+    if deck.tumour:
+        origin = f"{deck.path}: tumour"
+        nodes = named_set(mesh.node_sets, TUMOUR, origin)
+        moved = growth(mesh.points[nodes], np.array(deck.tumour.centre), deck.tumour.seed_radius, deck.tumour.volume)
+        of_deck.extend((3 * nodes + i, moved[:, i], np.zeros((len(nodes), 3)), origin) for i in range(3))
+    of_files = _motions(mesh, mesh.constraints)
+    if not of_deck and not of_files:
+        raise InputError(f"{deck.path}: nothing is fixed, displaced or grows; add [[fixed]], [[displaced]] or [tumour]")
+    own, given = (_without_clashes(mesh, motions) for motions in (of_deck, of_files))
+    _, mine, other = np.intersect1d(own.dofs, given.dofs, assume_unique=True, return_indices=True)
+    changed = own.displacements[mine] != given.displacements[other]
+    replaced: dict[tuple[str, str], set[int]] = {}
+    for at, instead in zip(mine[changed], other[changed], strict=True):
+        key, file = own.origins[at].removesuffix(".nodes"), given.origins[instead].partition(": line ")[0]
+        replaced.setdefault((key, file), set()).add(int(own.dofs[at]) // 3)
+    remarks = [
+        f"{key} replaces what {file} prescribes at {len(nodes)} nodes" for (key, file), nodes in replaced.items()
+    ]
+    left = np.ones(len(given.dofs), bool)
+    left[other] = False
+    both = [np.concatenate([one, more[left]]) for one, more in zip(own, given, strict=True)]
+    order = np.argsort(both[0])
+    return Prescribed(*(values[order] for values in both)), remarks
+
+
+#: Dofs (n,), their displacements (n,) and turns (n, 3), and where that is said.
+_Motion = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], str]
+
+
+def _motions(mesh: Mesh, constraints: Iterable[Constraint]) -> list[_Motion]:
+    """Each constraint's motion, direction by direction."""
+    found: list[_Motion] = []
+    for constraint in constraints:
         nodes = named_set(mesh.node_sets, constraint.node_set, constraint.origin)
         turned, arcs = np.zeros((len(nodes), 3)), np.zeros((len(nodes), 3, 3))
         if constraint.rotation:
@@ -441,23 +484,20 @@ def prescribe(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.flo
             where = constraint.origin.removesuffix("nodes") + "field"
             turned = turned + carry_over(constraint.field, constraint.field_metre, mesh.points[nodes], where)
         for direction, displacement in zip(constraint.directions, constraint.displacement, strict=True):
-            dofs.append(3 * nodes + direction)
-            values.append(displacement + turned[:, direction])
-            turns.append(arcs[:, direction])
-            origins.append(constraint.origin)
-    if deck.tumour:
-        origin = f"{deck.path}: tumour"
-        nodes = named_set(mesh.node_sets, TUMOUR, origin)
-        moved = growth(mesh.points[nodes], np.array(deck.tumour.centre), deck.tumour.seed_radius, deck.tumour.volume)
-        dofs.append((3 * nodes[:, None] + np.arange(3)).ravel())
-        values.append(moved.ravel())
-        turns.append(np.zeros((moved.size, 3)))
-        origins.append(origin)
-    if not dofs:
-        raise InputError(f"{deck.path}: nothing is fixed, displaced or grows; add [[fixed]], [[displaced]] or [tumour]")
-    every, at, source = np.concatenate(dofs), np.concatenate(values), np.repeat(np.arange(len(dofs)), [*map(len, dofs)])
+            moved = displacement + turned[:, direction]
+            found.append((3 * nodes + direction, moved, arcs[:, direction], constraint.origin))
+    return found
+
+
+def _without_clashes(mesh: Mesh, motions: list[_Motion]) -> Prescribed:
+    """All motions together, each dof once; InputError if one is to be in two places."""
+    origins = np.array([origin for *_, origin in motions], object)
+    every = np.concatenate([np.empty(0, np.int64), *(dofs for dofs, *_ in motions)])
+    at = np.concatenate([np.empty(0), *(moved for _, moved, *_ in motions)])
+    turning = np.concatenate([np.empty((0, 3)), *(turns for _, _, turns, _ in motions)])
+    source = np.repeat(np.arange(len(motions)), [len(dofs) for dofs, *_ in motions])
     order = np.lexsort((at, every))
-    every, at, source, turning = every[order], at[order], source[order], np.concatenate(turns)[order]
+    every, at, source, turning = every[order], at[order], source[order], turning[order]
     clash = np.flatnonzero((np.diff(every) == 0) & (np.diff(at) != 0))
     if len(clash):
         first = clash[0]
@@ -467,5 +507,5 @@ def prescribe(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.flo
             f"{'xyz'[every[first] % 3]}, and by {at[first] * 1e3:g} mm through {origins[source[first]]}; "
             f"take it out of one of the two ({len(clash)} such)"
         )
-    keep = np.append(True, np.diff(every) > 0)
-    return every[keep], at[keep], turning[keep]
+    keep = np.append(True, np.diff(every) > 0)[: len(every)]
+    return Prescribed(every[keep], at[keep], turning[keep], origins[source[keep]])

@@ -39,7 +39,9 @@ def check_file(file: Any, path: Path, *, numbers: bool = False) -> None:
             elif hasattr(item, "shape"):
                 room -= check_dataset(item, path)
                 if numbers and item.dtype.kind not in "fiuSb":
-                    raise InputError(f"{path}: {item.name} holds other than numbers and text; it is not read")
+                    raise InputError(
+                        f"{path}: {item.name} holds other than numbers and text of fixed length; it is not read"
+                    )
     # Each may be as large as the file, but not all of them.
     if room < 0:
         raise InputError(f"{path}: claims to hold more than its {path.stat().st_size} bytes; write it anew")

@@ -67,7 +67,33 @@ def test_a_flat_deck_is_read_whole(tmp_path):
     assert held.origin.endswith("deck.inp: line 34")
     ((cells, material),) = file.materials
     assert (cells, material.youngs_modulus, material.poissons_ratio, material.density) == ("solid", 3e-3, 0.49, 1e-9)
-    assert "skipped, for nothing here depends on it: *HEADING, *STATIC, *END STEP" in file.remarks[0]
+    assert file.remarks == []
+
+
+def test_what_is_skipped_is_listed_if_it_may_matter(tmp_path):
+    """Titles and requests for output are in every deck; those of contacts are no contacts."""
+    output = "*OUTPUT, FIELD\n*NODE OUTPUT\n U,\n*CONTACT OUTPUT\n CSTRESS,\n*RESTART, WRITE\n*END STEP"
+    file = read(tmp_path, FLAT.replace("*STATIC", "*VISCO").replace("*END STEP", output))
+    assert file.remarks == [f"{tmp_path / 'deck.inp'}: skipped, for nothing here depends on it: *VISCO"]
+    assert file.refused == []
+
+
+def test_a_deck_that_is_cut_short_says_where(tmp_path):
+    """Within a part all nodes are of it, and without an instance none are there."""
+    cut = ASSEMBLY[: ASSEMBLY.index("*Elset, elset=Set-1")]
+    (tmp_path / "deck.inp").write_text(cut)
+    words = "part Cube, which has 8 nodes, has no *INSTANCE; the file ends within *PART Cube: is it cut short?"
+    with pytest.raises(InputError) as caught:
+        overview.check(tmp_path / "deck.inp")
+    assert str(caught.value) == f"{tmp_path / 'deck.inp'}: {words}"
+    whole = ASSEMBLY[: ASSEMBLY.index("*Assembly")]
+    with pytest.raises(InputError, match=r"which has 8 nodes, has no \*INSTANCE; add one$"):
+        read(tmp_path, whole)
+    clipped = read(tmp_path, FLAT + cut)
+    assert [remark.partition("deck.inp: ")[2] for remark in clipped.remarks if "warning" in remark] == [
+        "part Cube is in no *INSTANCE, so not there",
+        "the file ends within *PART Cube: is it cut short?",
+    ]
 
 
 WRITTEN = {
@@ -201,6 +227,8 @@ def test_later_steps_take_nodes_over(tmp_path):
     assert at[35, 0] == {0.25}
     assert at[10, 0] == {-0.5}
     assert at[10, 1] == {0.0}
+    assert any("several steps; those at the end count" in remark for remark in file.remarks)
+    assert not any("several steps" in remark for remark in read(tmp_path, FLAT).remarks)  # held first, then moved
     new = read(tmp_path, FLAT + more.replace("*BOUNDARY", "*BOUNDARY, OP=NEW"))
     assert {c.displacement for c in new.constraints} == {(0.5,), (-0.5,)}
 

@@ -185,6 +185,7 @@ def test_cloud_of_a_block_is_irregular_and_follows_its_spacing():
         ((0.021, 0.021, 0.003), 0.011, "is 3 mm from .* move it away from there, or make the hexahedra smaller"),
         ((0.021, 0.021, 0.0), 0.011, "is 0 mm from"),
         ((0.021, 0.021, -0.001), 0.01, "not inside the cloud, but 1 mm from it; move it"),
+        ((0.02, 0.02, -0.05), 0.01, r"centre = \(20, 20, -50\) mm: is outside the body, 50 mm from it; move it inside"),
     ],
 )
 def test_a_seed_without_room_is_refused(centre, radius, message):

@@ -94,6 +94,17 @@ def test_a_result_without_stress_says_how_to_have_it(tmp_path):
         _ = opened.stress
 
 
+def test_a_deck_is_a_path_or_what_load_deck_made_of_it(result):
+    """One override need be no list: its letters would be taken for overrides."""
+    keys = ["block.elements=[3,3,3]", "block.cloud=all"]
+    deck = package.load_deck(CUBE, keys)
+    assert package.load_deck(CUBE, keys[0]).block.elements == deck.block.elements == (3, 3, 3)
+    models = package.build_model(deck), package.build_model(CUBE, keys), package.build_model(str(CUBE), keys)
+    assert len({model.domain_gradients.tobytes() for model in models}) == 1
+    with pytest.raises(package.InputError, match="give them to load_deck"):
+        package.build_model(deck, keys)
+
+
 def test_what_other_libraries_take(result):
     out, report = result
     with package.open_result(out) as opened:
@@ -110,6 +121,8 @@ def test_what_other_libraries_take(result):
             assert grid.n_points == len(opened.points) + len(store.read_model(out / "model.h5").domains)
             assert np.nanmin(grid.cell_data["J"]) == opened.jacobian[-1].min()
             assert np.array_equal(np.isnan(grid.cell_data["J"]), grid.cell_data["material"] < 0)
+            assert np.array_equal(np.isnan(grid.cell_data["J"]), grid.cell_data["kind"] == 1)  # EFG nodes
+            assert np.count_nonzero(grid.cell_data["kind"] == 2) == len(store.read_model(out / "model.h5").domains)
             with pytest.raises(IndexError, match="and no 99"):
                 opened.to_pyvista(99)
         assert repr(opened) == f"<RunResult {opened.path}: {len(opened.times)} frames>"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import resource
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -14,15 +16,17 @@ import pytest
 from conftest import complaint, mpitled
 from decks import CLOUD, FLAT, void_decks
 
-from mpitled import store
+from mpitled import export, store
 from mpitled.deck import MeshFiles, load_deck
 from mpitled.errors import InputError
+from mpitled.material import Material
 from mpitled.mesh import Mesh, grid_points, structured_hexahedra
 from mpitled.preprocess import build
 from mpitled.readers import meshes, tables
 from mpitled.solver import hexahedra
 from mpitled.speed import overview
 
+EPS = float(np.finfo(float).eps)
 GROWTH = """
 title = "a tumour in a block"
 [block]
@@ -192,14 +196,24 @@ def test_constraints_and_materials_of_the_files_count_with_those_of_the_deck(voi
     model = build(load_deck(scene))
     skull = model.node_sets["skull"]
     np.testing.assert_array_equal(model.prescribed_dofs, (3 * skull[:, None] + np.arange(3)).ravel())
-    edit(scene, "displacement = [0.0]", "displacement = [1.0]")
-    with pytest.raises(
-        InputError, match=r"fe.inp: line \d+.*mm in x.*through .*displaced.0.*|displaced.0.*fe.inp: line"
-    ):
-        build(load_deck(scene))
-    edit(scene, "displacement = [1.0]", "displacement = [0.0]")
+    assert not any(" replaces what " in remark for remark in model.remarks)
     edit(scene, 'nodes = "skull"', 'nodes = "scull"')
     with pytest.raises(InputError, match="no set 'scull'; sets: interface, skull"):
+        build(load_deck(scene))
+
+
+def test_a_deck_replaces_what_the_files_prescribe_where_it_names_dofs(void):
+    """The file holds the skull in x, y and z; the deck moves it along x, for which one remark is enough."""
+    scene = void / "scene.toml"
+    edit(scene, "displacement = [0.0]", "displacement = [1.0]")
+    model = build(load_deck(scene))
+    np.testing.assert_array_equal(model.prescribed_displacements, np.tile([1e-3, 0, 0], len(model.node_sets["skull"])))
+    said = [remark for remark in model.remarks if " replaces what " in remark]
+    n = len(model.node_sets["skull"])
+    assert said == [f"{scene}: displaced.0 replaces what {void / 'fe.inp'} prescribes at {n} nodes"]
+    twice = scene.read_text() + '[[fixed]]\nnodes = "skull"\n'
+    scene.write_text(twice)
+    with pytest.raises(InputError, match=r"displaced\.0.* moved by 1 mm in x, and by 0 mm through .*fixed\.0"):
         build(load_deck(scene))
 
 
@@ -371,6 +385,7 @@ def test_an_exported_model_runs_to_the_same_bits(tmp_path):
         one, other = (getattr(model, name) for model in models)
         assert one.tobytes() == other.tobytes(), name
     assert models[0].materials == models[1].materials
+    assert not any("several steps" in remark for remark in models[1].remarks)
     assert models[0].surface_areas.tobytes() == models[1].surface_areas.tobytes()
     for kind in ("node_sets", "cell_sets"):
         one, other = (getattr(model, kind) for model in models)
@@ -384,6 +399,26 @@ def test_an_exported_model_runs_to_the_same_bits(tmp_path):
     assert np.abs(last[0][0]).max() > 5e-4
     for one, other in zip(*last, strict=True):
         assert one.tobytes() == other.tobytes()
+
+
+def test_exported_materials_are_read_as_what_they_were(void):
+    """Each cell has one of its own, by C10 and D1, from which E and nu come back but for round-off.
+
+    Shear and bulk modulus take 2 and 3 roundings, the way through D1 and back 2 more, E of both 5, and nu 4.
+    """
+    model = build(load_deck(void / "scene.toml"))
+    rng, n = np.random.default_rng(0), model.n_cells
+    laws = zip(10 ** rng.uniform(-3, 12, n), rng.uniform(-0.99, 0.4999, n), strict=True)
+    given = [Material(f"m{i}", float(E), float(nu), 1000.0) for i, (E, nu) in enumerate(laws)]
+    model = replace(model, materials=tuple(given), material=np.arange(n, dtype=np.int16))
+    store.write_model(void / "model.h5", model, "key", {})
+    export.write_abaqus(void / "model.h5", void / "decks")
+    file = meshes.read_file(void / "decks" / "fe.inp")
+    assert len(file.materials) == len(model.hexahedra)
+    for (_, found), material in zip(file.materials, given, strict=False):
+        assert found.youngs_modulus == pytest.approx(material.youngs_modulus, rel=5 * EPS)
+        assert found.poissons_ratio == pytest.approx(material.poissons_ratio, rel=0, abs=3 * EPS)
+    assert "*ELASTIC" not in (void / "decks" / "fe.inp").read_text()
 
 
 @pytest.mark.parametrize("cloud", ["none", "all"])
@@ -413,6 +448,26 @@ def test_a_changed_include_builds_the_model_anew(tmp_path):
 
 
 # ------------------------------------------------------------ all together
+
+
+def test_a_load_that_is_not_applied_is_a_warning_of_the_result(tmp_path):
+    """Said once before the run, once at its end, by -q too, and at the top of the page."""
+    (tmp_path / "fe.inp").write_text(FLAT.replace("*END STEP", "*DSLOAD\n top, P, 1.\n*END STEP"))
+    (tmp_path / "scene.toml").write_text(
+        '[mesh]\nfe = "fe.inp"\nunit = "mm"\nstress_unit = "MPa"\n[solver]\nmethod = "quasi-static"\nload_time = 0.01\n'
+    )
+    told = f"{tmp_path / 'fe.inp'}: line 39: *DSLOAD is not applied, as no load is"
+    done = mpitled("run", tmp_path / "scene.toml", "--out", tmp_path / "out")
+    assert [line for line in done.stderr.splitlines() if "DSLOAD" in line] == [f"warning: {told}"]
+    assert [line.strip() for line in done.stdout.splitlines() if "DSLOAD" in line] == [f"warning: {told}"]
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["warnings"] == [told]
+    quietly = mpitled("run", tmp_path / "scene.toml", "-q", "--out", tmp_path / "out").stderr
+    assert quietly == f"mpitled: warning: {told}\n"
+    mpitled("report", tmp_path / "out", "--html")
+    top, _, below = (tmp_path / "out" / "report.html").read_text().partition("<h2>")
+    assert "DSLOAD" in top
+    assert "DSLOAD" not in below
 
 
 @pytest.mark.study

@@ -178,7 +178,9 @@ def test_a_tumour_that_can_never_fit_is_refused(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_text(TUMOUR)
     line = complaint(mpitled("check", path, "--set", "tumour.volume=3e6", status=2))
-    said = "tumour.volume = 3e+06: its sphere of 89.5 mm radius reaches beyond the outer surface, which is fixed 20 mm"
+    said = (
+        "tumour.volume = 3000000: its sphere of 89.5 mm radius reaches beyond the outer surface, which is fixed 20 mm"
+    )
     assert line == f"mpitled: {path}: {said} from tumour.centre; lower it"
     # A surface that is free makes room.
     path.write_text(TUMOUR.replace('nodes = "surface"', 'nodes = "x0"'))

@@ -91,7 +91,7 @@ def test_a_page_has_what_the_scene_has(brain, stopped):
     assert sections(out) == SECTIONS
     text = (out / page.PAGE).read_text()
     assert "A cylinder &lt;squeezed&gt; &amp; more" in text
-    assert re.search(r"not complete: [\d.]+% of the load time: unstable at .*worst is", text)
+    assert re.search(r"not complete: the last frame is at [\d.]+% of the load; unstable at .*worst is", text)
     assert "drawn by matplotlib (PyVista found no way to draw here)" in text
     assert "gather, add, add_gathered, scatter: one rank" in text
 

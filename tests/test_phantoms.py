@@ -57,6 +57,13 @@ def test_volumes_converge_at_second_order(mesher, sizes, exact):
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
 
 
+@pytest.mark.parametrize(("mesher", "centre"), [(cylinder, (0.1, 0.0, 0.05)), (ellipsoid, (0.0, 0.0, 0.11))])
+def test_a_tumour_far_outside_is_said_to_be_outside(mesher, centre):
+    """50 mm from the body: no radius of the cloud is the remedy."""
+    with pytest.raises(InputError, match=r"^tumour.centre = .* outside the body, 50(\.\d)? mm from it; move it inside"):
+        mesher(tumour=dataclasses.replace(TUMOUR, centre=centre), cloud="core")
+
+
 def test_cylinder_has_its_nodes_on_its_surface():
     mesh = cylinder()
     r, z = np.hypot(*mesh.points[:, :2].T), mesh.points[:, 2]

@@ -272,6 +272,7 @@ def test_the_energies_of_relaxation_add_up(tmp_path):
     assert external - taken == pytest.approx(internal, rel=1e-3)
     assert float(lines["from the static solution, by its own estimate"].removesuffix(" mm")) < 0.01
     assert not {"time step", "kinetic/internal, largest after 10 %", "energy of added mass"} & lines.keys()
+    assert ", to 100.0% of the load\n" in mpitled("info", tmp_path / "out" / "result.vtkhdf").stdout
 
 
 def test_unfinished_results_without_figures(tmp_path):
@@ -286,7 +287,7 @@ def test_unfinished_results_without_figures(tmp_path):
         writer.write_frame(time, values, {"J": np.ones(model.n_cells)})
     writer.abandon({"min_jacobian": float("nan"), "peak_memory_bytes": [1, 2]})
     printed = mpitled("report", tmp_path).stdout
-    assert "not complete: 25.0% of the load time" in printed
+    assert "not complete: the last frame is at 25.0% of the load\n" in printed
     assert "smallest J" not in printed
     made = strictly(tmp_path / "report.json")
     assert not made["complete"]
@@ -346,7 +347,28 @@ def test_info_of_the_machine_and_of_files(grown):
     assert "a whole result" in mpitled("info", grown[0] / "result.vtkhdf").stdout
     assert "a whole model" in mpitled("info", grown[0] / "model.h5").stdout
     assert "folder" in complaint(mpitled("info", grown[0], status=2))
-    assert "report.json" in complaint(mpitled("info", grown[0] / "report.json", status=2))
+
+
+def test_info_knows_the_files_around_a_run(tmp_path):
+    """Each with the command for it; a file of ours that is cut short is said to be that."""
+    for name, words in {
+        "a.toml": f"is a deck: mpitled check {tmp_path / 'a.toml'}",
+        "a.inp": f"is a mesh: mpitled check {tmp_path / 'a.inp'}",
+        "a.k": f"is a mesh: mpitled check {tmp_path / 'a.k'}",
+        "report.json": f"is the report of a run: mpitled report {tmp_path}",
+        "a.csv": "is a table of text; open it in an editor or a spreadsheet",
+        "a.png": "is there to be looked at; open it in a viewer or a browser",
+    }.items():
+        (tmp_path / name).write_text("anything")
+        assert complaint(mpitled("info", tmp_path / name, status=2)) == f"mpitled: {tmp_path / name}: {words}"
+    columns = {"case": [1, 2], "warnings": ["", "the cloud is too coarse"]}
+    path = tmp_path / "table.h5"
+    store.write_columns(path, {"table": columns, "times": {"case": [1, 2]}})
+    printed = mpitled("info", path).stdout.splitlines()
+    assert printed[1:] == ["table            2 rows of case, warnings", "times            2 rows of case"]
+    assert json.loads(mpitled("info", path, "--json").stdout)["tables"]["times"] == {"columns": ["case"], "rows": 2}
+    path.write_bytes(path.read_bytes()[:-100])
+    assert "(it is cut short); make it anew" in complaint(mpitled("info", path, status=2))
 
 
 def test_info_names_what_is_missing(monkeypatch):

@@ -201,7 +201,7 @@ def _judge(case: Case, runs: _Runs) -> dict[str, Any]:
         return row | {"message": str(problem)}
     own = report.get("static_distance_mm")
     model, field, tolerance = _field(folder)
-    warnings = [*report["warnings"], *(remark for remark in model.remarks if remark.startswith("warning: "))]
+    warnings = report["warnings"]
     if own is None and case.method != "waves":
         if warnings:
             return row | {"outcome": WARNED, "message": " | ".join(warnings)}

@@ -119,7 +119,10 @@ def fill_void(
     Raises InputError if nothing is dropped, if no node fits in, or if the seed does not lie inside the void.
     """
     if not dropped.any():
-        raise InputError("cloud: no hexahedron is replaced by it; enlarge cloud.radius or core_share")
+        if tumour is not None:
+            _check_inside(points, boundary_faces(hexahedra), tumour)
+        key = "cloud.radius" if tumour is not None else "core_share"
+        raise InputError(f"cloud: no hexahedron is replaced by it; enlarge {key}")
     corners = points[hexahedra[dropped]]
     boundary = boundary_faces(hexahedra[dropped])
     seed, spacing = _seed(cloud, tumour, element_size)
@@ -438,19 +441,9 @@ def _check_room(boundary: NDArray[np.float64], tumour: deck.Tumour, element_size
 
     radius: cloud.radius; hexahedra with their middles within it are replaced, where there are any that can be.
     """
-    quads = boundary - np.asarray(tumour.centre, float)
+    inside, room = _place(boundary, tumour)
     where = f"tumour.centre = {in_millimetres(np.asarray(tumour.centre, float))}"
-    # Solid angles of a closed surface sum to 4 pi for a point inside, to 0 outside (van Oosterom and Strackee 1983).
-    a, b, c = np.moveaxis(np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]), 1, 0)
-    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
-    denominator = la * lb * lc + (a * b).sum(1) * lc + (b * c).sum(1) * la + (c * a).sum(1) * lb
-    solid_angle = 2 * np.arctan2((a * np.cross(b, c)).sum(1), denominator).sum()
-    s = np.linspace(0, 1, 9)
-    weights = np.stack(
-        [np.outer(1 - s, 1 - s), np.outer(s, 1 - s), np.outer(s, s), np.outer(1 - s, s)], axis=-1
-    ).reshape(-1, 4)
-    room = min(np.linalg.norm(quads.transpose(0, 2, 1) @ w, axis=1).min() for w in weights)
-    if solid_angle < 2 * np.pi:
+    if not inside:
         raise InputError(f"{where}: is not inside the cloud, but {length(room)} from it; move it")
     needed = tumour.seed_radius + element_size
     if room < needed:
@@ -462,6 +455,34 @@ def _check_room(boundary: NDArray[np.float64], tumour: deck.Tumour, element_size
             f"{where}: is {length(room)} from the cloud's boundary, but the seed and an element's size of cloud "
             f"around it need {length(needed)}; {remedy}, or make the hexahedra smaller"
         )
+
+
+def _check_inside(points: NDArray[np.float64], faces: NDArray[np.int64], tumour: deck.Tumour) -> None:
+    """The tumour's centre lies inside the body with faces (n, 4)."""
+    inside, room = _place(points[faces], tumour)
+    if not inside:
+        centre, low, high = np.asarray(tumour.centre, float), points.min(axis=0), points.max(axis=0)
+        hint = looks_like_metres(centre, low, high)
+        raise InputError(
+            f"tumour.centre = {in_millimetres(centre)}: is outside the body, {length(room)} from it; move it inside "
+            f"(from {in_millimetres(low)} to {in_millimetres(high)})" + (f"; {hint}" if hint else "")
+        )
+
+
+def _place(boundary: NDArray[np.float64], tumour: deck.Tumour) -> tuple[bool, float]:
+    """Whether the tumour's centre lies inside a closed surface (n, 4, 3), and how far from it, m."""
+    quads = boundary - np.asarray(tumour.centre, float)
+    # Solid angles of a closed surface sum to 4 pi for a point inside, to 0 outside (van Oosterom and Strackee 1983).
+    a, b, c = np.moveaxis(np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]), 1, 0)
+    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    denominator = la * lb * lc + (a * b).sum(1) * lc + (b * c).sum(1) * la + (c * a).sum(1) * lb
+    solid_angle = 2 * np.arctan2((a * np.cross(b, c)).sum(1), denominator).sum()
+    s = np.linspace(0, 1, 9)
+    weights = np.stack(
+        [np.outer(1 - s, 1 - s), np.outer(s, 1 - s), np.outer(s, s), np.outer(1 - s, s)], axis=-1
+    ).reshape(-1, 4)
+    room = min(np.linalg.norm(quads.transpose(0, 2, 1) @ w, axis=1).min() for w in weights)
+    return bool(solid_angle >= 2 * np.pi), float(room)
 
 
 def _trilinear(cells: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,7 +1,7 @@
 """Abaqus decks (.inp), as Abaqus/CAE, HyperMesh, Cubit, gmsh and CalculiX write them.
 
-Keywords that do not matter to an elastic solid with prescribed displacements are skipped and listed; those that
-change its mechanics and cannot be computed are kept as `MeshFile.refused`.
+Keywords that do not matter to an elastic solid with prescribed displacements are skipped, and listed if not every deck
+has them; those that change its mechanics and cannot be computed are kept as `MeshFile.refused`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,13 @@ _SOLIDS = {
     15: "other", 20: "other", 27: "other",
 }  # fmt: skip
 
-#: Keywords, without blanks, that tie, load or move parts in ways that are not computed; what begins with CONTACT too.
+#: Keywords, without blanks, that every deck has and nobody misses: titles, output, and the solution of a step.
+_HARMLESS = {
+    "HEADING", "PREPRINT", "STATIC", "ENDSTEP", "RESTART", "OUTPUT", "NODEOUTPUT", "ELEMENTOUTPUT", "CONTACTOUTPUT",
+    "ENERGYOUTPUT", "NODEPRINT", "ELPRINT", "CONTACTPRINT", "ENERGYPRINT", "NODEFILE", "ELFILE", "CONTACTFILE",
+    "FILEFORMAT", "MONITOR",
+}  # fmt: skip
+#: Keywords that tie, load or move parts in ways that are not computed; what begins with CONTACT too.
 _REFUSED = {
     "TIE", "MPC", "EQUATION", "COUPLING", "KINEMATICCOUPLING", "DISTRIBUTINGCOUPLING", "RIGIDBODY", "EMBEDDEDELEMENT",
     "SHELLTOSOLIDCOUPLING", "TRANSFORM", "SPRING", "DASHPOT", "MASS", "ROTARYINERTIA", "CONNECTORSECTION",
@@ -87,6 +93,9 @@ class _Reader:
             if keyword.name in ("NODE", "ELEMENT"):
                 keyword.data.clear()  # the text is not needed any more
         self.keywords.clear()
+        if self.scope is not self.found.root:
+            kind = "PART" if any(self.scope is part for part in self.found.parts.values()) else "INSTANCE"
+            self.found.unended = f"*{kind} {self.scope.name}"
         if self.skipped:
             self.found.remarks.append(
                 f"{self.found.path}: skipped, for nothing here depends on it: {meshfile.listed(self.skipped, 40)}"
@@ -98,6 +107,8 @@ class _Reader:
         handler = getattr(self, f"_{name.lower()}", None) if name in _HANDLED else None
         if handler:
             handler(keyword)
+        elif name in _HARMLESS:
+            pass
         elif name in _REFUSED or name.startswith(("CONTACT", "CONNECTOR")):
             self.found.refused.append(f"{keyword.origin}: {keyword.shown} changes the mechanics and cannot be computed")
         elif name in _GENERATING:

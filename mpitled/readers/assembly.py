@@ -103,6 +103,7 @@ class Definitions:
     parts: dict[str, Scope] = field(default_factory=dict)
     instances: dict[str, Scope] = field(default_factory=dict)
     assembly: str = ""  # its name
+    unended: str = ""  # the part or instance that the text ends in
     materials: dict[str, Material] = field(default_factory=dict)
     boundaries: list[tuple[int, Keyword]] = field(default_factory=list)  # with the step that each is in, from 1
     remarks: list[str] = field(default_factory=list)
@@ -137,11 +138,18 @@ class Model:
             points.append(own_points)
             ids.append(own_ids)
             n_nodes, n_cells = n_nodes + len(own_ids), n_cells + len(own_cells)
-        unused = [part.name for key, part in given.parts.items() if part.ids and not self._instanced(part)]
+        unused = {part.name: sum(map(len, part.ids)) for part in given.parts.values() if not self._instanced(part)}
+        unused = {name: n_nodes for name, n_nodes in unused.items() if n_nodes}
+        ends = f"the file ends within {given.unended}: is it cut short?" if given.unended else ""
+        if unused and not n_nodes:
+            name, n = next(iter(unused.items()))
+            raise InputError(f"{given.path}: part {name}, which has {n} nodes, has no *INSTANCE; {ends or 'add one'}")
         if unused:
             self.remarks.append(
                 f"warning: {given.path}: part {meshfile.listed(unused)} is in no *INSTANCE, so not there"
             )
+        if ends:
+            self.remarks.append(f"warning: {given.path}: {ends}")
         self.mesh = MeshFile(
             path=given.path,
             format="Abaqus",
@@ -155,7 +163,7 @@ class Model:
         self._found: dict[tuple[str, str, str], NDArray[np.int64]] = {}
 
     def _instanced(self, part: Scope) -> bool:
-        return any(part.ids[0] is ids for scope in self.given.instances.values() for ids in scope.ids)
+        return any(part.ids and part.ids[0] is ids for scope in self.given.instances.values() for ids in scope.ids)
 
     @staticmethod
     def _with_rows(block: Cells, numbering: Numbering, offset: int) -> Cells:
@@ -340,14 +348,13 @@ class Model:
 
     def _constrain(self, names: dict[tuple[str, str, str], str]) -> None:
         """The boundary conditions at the end of the last step: later steps take nodes over from earlier ones."""
-        if len({step for step, _ in self.given.boundaries}) > 1:
-            self.remarks.append(f"{self.mesh.path}: boundary conditions of several steps; those at the end count")
         constraints: list[tuple[int, Constraint, NDArray[np.int64]]] = []
         for step, keyword in self.given.boundaries:
             constraints += [(step, *found) for found in self._boundary(names, keyword)]
         claimed = np.zeros((len(self.mesh.points), 3), bool)
         last = max((step for step, _, _ in constraints), default=0)
         kept: list[Constraint] = []
+        taken_over = False
         for step in range(last, -1, -1):
             of_step = [(constraint, nodes) for at, constraint, nodes in constraints if at == step]
             for constraint, nodes in of_step:
@@ -355,6 +362,7 @@ class Model:
                 if free.all():
                     kept.append(constraint)
                     continue
+                taken_over = True
                 for i, direction in enumerate(constraint.directions):
                     if free[:, i].any():
                         rest = nodes[free[:, i]]
@@ -365,6 +373,8 @@ class Model:
                         kept.append(Constraint(name, (direction,), (values,), constraint.origin))
             for constraint, nodes in of_step:
                 claimed[nodes[:, None], constraint.directions] = True
+        if taken_over:
+            self.remarks.append(f"{self.mesh.path}: boundary conditions of several steps; those at the end count")
         self.mesh.constraints = kept
 
     def _boundary(

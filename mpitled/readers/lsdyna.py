@@ -279,7 +279,7 @@ class _Reader:
             keyword.fail("is not read; let the preprocessor write out plain nodes and solids")
         elif name.startswith(_LOADS):
             self.remarks.append(f"warning: {keyword.origin}: *{name} is not applied, as no load is")
-        elif not name.startswith(("KEYWORD", "TITLE", "COMMENT")):
+        elif not name.startswith(("KEYWORD", "TITLE", "COMMENT", "END", "DATABASE_", "CONTROL_TERMINATION")):
             self.skipped[f"*{name}"] = None
 
     def _cards(self, keyword: _Keyword, widths: list[int] | None = None) -> Iterator[_Card]:

@@ -157,8 +157,8 @@ def _mesh(run: _Run) -> Iterator[str]:
         ("hexahedra", len(model.hexahedra)), ("support domains", len(model.domains)),
     ]  # fmt: skip
     yield markup.table([], [(name, f"{count:,}") for name, count in counts])
-    if model.remarks:
-        yield markup.listed(model.remarks)
+    if model.notes:  # the warnings stand at the top
+        yield markup.listed(model.notes)
     if run.draws:
         from mpitled.results import plot
 

@@ -153,7 +153,8 @@ def compute(outcome: Outcome) -> dict[str, Any]:
     report |= outcome.figures
     if solver := outcome.metadata.get("deck", {}).get("solver"):
         report["method"] = solver["method"]
-    report["warnings"] = _warnings(report)
+    # What there is of a run that was stopped is not taken for a result, and its figures are off for that reason.
+    report["warnings"] = [*model.warnings, *(_warnings(report) if outcome.complete else ())]
     return report
 
 
@@ -189,7 +190,7 @@ def _warnings(report: Mapping[str, Any]) -> list[str]:
             f"the ramp ended {distance:.2g} mm from the static solution: load more slowly (solver.load_time), or take "
             'solver.method = "dynamic-relaxation"'
         )
-    elif report["complete"] and report.get("method") == "quasi-static" and "static_distance_mm" not in report:
+    elif report.get("method") == "quasi-static" and "static_distance_mm" not in report:
         found.append(
             "how far the ramp ended from the static solution could not be found: load more slowly (solver.load_time), "
             'or take solver.method = "dynamic-relaxation"'
@@ -199,8 +200,8 @@ def _warnings(report: Mapping[str, Any]) -> list[str]:
 
 def incomplete(report: Mapping[str, Any]) -> str:
     """What there is of a run that did not come to its end, and why, if it could say so."""
-    stopped = f": {report['stopped']}" if "stopped" in report else ""
-    return f"not complete: {report['load_share']:.1%} of the load time{stopped}"
+    stopped = f"; {report['stopped']}" if "stopped" in report else ""
+    return f"not complete: the last frame is at {report['load_share']:.1%} of the load{stopped}"
 
 
 def table(report: Mapping[str, Any], *, whole: bool = True) -> str:

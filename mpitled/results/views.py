@@ -117,11 +117,7 @@ def pyvista() -> Any:
 
 
 def grid(result: store.Result, frame: int) -> Any:
-    """A frame as pyvista.UnstructuredGrid, undeformed, in metres: hexahedra, and vertices for the rest.
-
-    At points: "displacement", the field's; in cells: "J", nan where there is no cell of the model but an EFG node, and
-    "material", the number of the deck's material there, or -1. InputError without PyVista.
-    """
+    """A frame as pyvista.UnstructuredGrid: see `mpitled.interface.RunResult.to_pyvista`. InputError without PyVista."""
     library, hexahedra = pyvista(), result.hexahedra
     numbers = result.point_data("node_id")
     rest = np.setdiff1d(np.arange(len(numbers)), hexahedra)
@@ -131,6 +127,7 @@ def grid(result: store.Result, frame: int) -> Any:
     for name, values, none in (
         ("J", result.cell_data("J", frame), np.nan),
         ("material", result.cell_data("material"), -1),
+        ("kind", result.cell_data("kind"), store.EFG_NODE),
     ):
         at_rows = np.full(len(numbers), none, values.dtype)  # of integration points, which are the last cells, in order
         at_rows[numbers < 0] = values[len(values) - np.count_nonzero(numbers < 0) :]

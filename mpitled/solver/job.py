@@ -12,6 +12,7 @@ from mpitled import deck as decks
 from mpitled import store
 from mpitled.deck import Deck
 from mpitled.errors import InputError, MpitledError, UnstableError, everywhere
+from mpitled.model import WARNING
 from mpitled.solver import checkpoint
 from mpitled.solver.halo import World
 from mpitled.solver.progress import Interrupts, Phases
@@ -145,7 +146,7 @@ def prepare(
         path = world.on_leader(lambda: build(deck, directory, quiet)[0])
     if world.leads and not quiet:
         for remark in store.read_remarks(path):
-            print(f"note: {remark}", file=sys.stderr, flush=True)
+            print(remark if remark.startswith(WARNING) else f"note: {remark}", file=sys.stderr, flush=True)
     with phases("partition"):
         if world.size > 1:
             world.on_leader(lambda: ensure_partition(path, world.size, deck.partition.seed, quiet))
@@ -171,6 +172,6 @@ def prepare(
 def ensure_partition(path: Path, n_parts: int, seed: int, quiet: bool = True) -> None:
     """Partition a model unless it is partitioned in as many parts."""
     if not store.has_partition(path, n_parts):
+        divide(path, n_parts, seed)
         if not quiet:
             print(f"note: the model is cut in {n_parts} parts", file=sys.stderr, flush=True)
-        divide(path, n_parts, seed)

@@ -94,17 +94,18 @@ class March:
             self.longest = float(solver.time_step)
             if not self.scales_mass and self.longest > critical:
                 raise InputError(
-                    f"solver.time_step = {self.longest:g}: is longer than the critical step of the undeformed model, "
-                    f"{critical:.3g} s; give at most {math.floor(critical * 1e8) / 1e8:g} (s), or leave it to auto"
+                    f"solver.time_step = {self.longest:.10g}: is longer than the critical step of the undeformed "
+                    f"model, {critical:.3g} s; give at most {math.floor(critical * 1e8) / 1e8:g} (s), or leave it to "
+                    "auto"
                 )
             if self.longest * FEW > self.end:
                 raise InputError(
-                    f"solver.time_step = {self.longest:g}: leaves {self.end / self.longest:.2g} steps for a run of "
+                    f"solver.time_step = {self.longest:.10g}: leaves {self.end / self.longest:.2g} steps for a run of "
                     f"{self.end:g} s; give at most {self.end / FEW:g} (s), or leave it to auto"
                 )
         if self.end / self.longest > MOST_STEPS:
             raise InputError(
-                f"solver.load_time = {solver.load_time:g}: takes {self.end / self.longest:.2g} steps of "
+                f"solver.load_time = {solver.load_time:.10g}: takes {self.end / self.longest:.2g} steps of "
                 f"{self.longest:.2g} s; check the units of densities and moduli, or shorten it"
             )
         shortest, longest = (int(min(LONGEST_UNWATCHED, max(1, self.end / self.longest // n))) for n in (MANY, FEW))

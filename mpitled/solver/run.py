@@ -79,7 +79,7 @@ class Run:
         self.term_seconds: dict[str, float] = {}
         self.distance = math.nan
         self.volume = model["volume_m3"]
-        self.watch = Watch(world, sub, self.volume, _remedy(deck))
+        self.watch = self._watch()
         self.recoveries, self.looks = 0, 0
         self.frames, self.written = 0, -math.inf  # how many, and the time of the last
         # What a ramp came to, figures and displacements, from where its distance to the static solution is looked for.
@@ -99,6 +99,9 @@ class Run:
     def _relaxation(self) -> Relaxation:
         deck, halo = self.deck, self._halo(Relaxation.components(self.sub))
         return Relaxation(deck.solver, deck.output.frames, self.sub, self.world, self.force_halo, halo)
+
+    def _watch(self) -> Watch:
+        return Watch(self.world, self.sub, self.volume, self.deck.path.name, _remedy(self.deck))
 
     def free(self) -> None:
         """Give back what ranks share. Collective; the run's end."""
@@ -373,7 +376,7 @@ class Run:
         if self.loaded is None:
             ramp, energy = self.method.state, self.watch.own_energy
             self.loaded = ramp.u[:, :n].copy()
-            self.method, self.watch = self._relaxation(), Watch(self.world, self.sub, self.volume, _remedy(self.deck))
+            self.method, self.watch = self._relaxation(), self._watch()
             self.method.start_from(ramp, energy)
             self.method.begin()
         relaxation = self.method
@@ -512,7 +515,7 @@ def _remedy(deck: Deck) -> str:
     slower = "more solver.load_steps" if deck.solver.method == "dynamic-relaxation" else "a longer solver.load_time"
     if deck.solver.time_step != "auto":
         slower = f"leave solver.time_step to auto, or {slower}"
-    finer = "refine the mesh or the cloud there"
+    finer = "refine the mesh or the cloud where cells deform most"
     if deck.tumour:
         return f"load more slowly ({slower}), {finer}, or enlarge tumour.seed_radius or cloud.radius"
     return f"load more slowly ({slower}), or {finer}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpitled.errors import UnstableError
 from mpitled.solver.halo import World
@@ -27,14 +28,15 @@ class Watch:
 
     LASTING = Kept(alike=("figures", "largest_kinetic_ratio", "largest_energy"))
 
-    def __init__(self, world: World, sub: Subdomain, volume: float, remedy: str) -> None:
-        """volume: of the whole model, m^3; remedy: of instability."""
-        self.world, self.sub, self.remedy = world, sub, remedy
+    def __init__(self, world: World, sub: Subdomain, volume: float, scene: str, remedy: str) -> None:
+        """volume: of the whole model, m^3; scene: the deck's name; remedy: of instability."""
+        self.world, self.sub, self.scene, self.remedy = world, sub, scene, remedy
         self.figures: dict[str, float] = {}  # of all ranks, at the last look
         self.own_energy = 0.0  # J, in this rank's cells
         self.largest_kinetic_ratio = 0.0
         self.request = 0  # the most that any rank asked for at the last look
         self.largest_energy = 0.0
+        self._smallest = 0, math.inf  # this rank's cell of least J when all was well at the last look, and its J
         # The strain energy of the undeformed body is no better than this, J: tr C - 3 and ln J are not quite 0.
         self._noise = 8 * float(np.finfo(sub.precision).eps) * max(m.mu for m in sub.rows.materials) * volume
 
@@ -57,7 +59,11 @@ class Watch:
         figures["kinetic_ratio"] = figures["kinetic"] / internal if internal > 0 else 0.0
         self.figures, self.request = figures, int(table[:, -1].max())
         finite = math.isfinite(internal + figures["kinetic"] + figures["external"])
-        if not finite or figures["min_jacobian"] <= 0:
+        where = f"unstable at {state.share:.1%} of the load of {self.scene}"
+        smallest = figures["min_jacobian"]  # J that are not a number count for nothing here, but make energies such
+        if not math.isfinite(smallest) or (smallest > 0 and not finite):  # no cell is the worst now
+            raise UnstableError(f"{where}: displacements grew without bound (diverged){self._before()}; {self.remedy}")
+        if smallest <= 0:
             reason = "a cell is turned inside out"
         elif balance > BALANCE_LIMIT * largest + self._noise and state.step >= LEDGER_STARTS:
             reason = (
@@ -68,30 +74,51 @@ class Watch:
             self.largest_energy = largest
             if state.share >= 0.1:
                 self.largest_kinetic_ratio = max(self.largest_kinetic_ratio, figures["kinetic_ratio"])
+            jacobian = method.survey.jacobian[:-1]
+            cell = int(jacobian.argmin())
+            self._smallest = cell, float(jacobian[cell])
             return
-        worst = int(np.argmin(np.where(np.isnan(columns["min_jacobian"]), -np.inf, columns["min_jacobian"])))
+        worst = int(np.argmin(columns["min_jacobian"]))
         cell = world.broadcast(self._worst_cell(method) if world.rank == worst else None, worst)
         raise UnstableError(
-            f"unstable at {state.share:.1%} of the load: {reason}; {cell}; the step is "
-            f"{figures['step_ratio']:.2f} of the longest stable one; {self.remedy}"
+            f"{where}: {reason}; {cell}; the step is {figures['step_ratio']:.2f} of the longest stable one; "
+            f"{self.remedy}"
         )
 
     def _worst_cell(self, method: March | Relaxation) -> str:
         """What and where the cell with the smallest J on this rank is, in a few words."""
-        rows, jacobian, state = self.sub.rows, method.survey.jacobian[:-1], method.state
-        cell = int(np.argmin(np.where(np.isnan(jacobian), -np.inf, jacobian)))
-        hexahedron = cell < rows.n_own_hexahedra
-        kind, k = ("hexahedra", cell) if hexahedron else ("domains", cell - rows.n_own_hexahedra)
-        local = rows.local(rows.read(kind, k, k + 1)[0])
-        points = rows.read("points")[local]
-        x, y, z = 1e3 * (points.mean(axis=0) if hexahedron else rows.read("domain_points", k, k + 1)[0])
+        jacobian, state = method.survey.jacobian[:-1], method.state
+        cell = int(np.argmin(jacobian))
+        named, local = self._named(cell)
+        points = self.sub.rows.read("points")[local]
         edges = points - points.mean(axis=0)
         stretched = edges + state.u[:, local].T - state.u[:, local].T.mean(axis=0)
         stretch = np.linalg.norm(stretched, axis=1).max() / np.linalg.norm(edges, axis=1).max()
+        return (
+            f"worst is {named} with J = {jacobian[cell]:.3g} now, {state.smallest_jacobian:.3g} at its worst, and a "
+            f"stretch of {stretch:.3g}"
+        )
+
+    def _before(self) -> str:
+        """Where J was smallest of all ranks at the last look that was well, if there was one. Collective."""
+        cell, jacobian = self._smallest
+        smallest = self.world.gather([jacobian])[:, 0]
+        worst = int(smallest.argmin())
+        if not math.isfinite(smallest[worst]):
+            return ""
+        named = self.world.broadcast(self._named(cell)[0] if self.world.rank == worst else None, worst)
+        return f"; until then the worst was {named} with J = {smallest[worst]:.3g}"
+
+    def _named(self, cell: int) -> tuple[str, NDArray[np.int64]]:
+        """What and where a cell of this rank is, in a few words, and its nodes (k,), by this rank's numbers."""
+        rows = self.sub.rows
+        hexahedron = cell < rows.n_own_hexahedra
+        kind, k = ("hexahedra", cell) if hexahedron else ("domains", cell - rows.n_own_hexahedra)
+        local = rows.local(rows.read(kind, k, k + 1)[0])
+        place = rows.read("points")[local].mean(axis=0) if hexahedron else rows.read("domain_points", k, k + 1)[0]
+        x, y, z = 1e3 * place
         number, material = (rows.read(name, cell, cell + 1)[0] for name in ("cells", "material"))
         return (
-            f"worst is {'hexahedron' if hexahedron else 'support domain'} {number} "
-            f"({rows.materials[material].name}) at ({x:.1f}, {y:.1f}, {z:.1f}) mm on rank {self.world.rank} "
-            f"with J = {jacobian[cell]:.3g} now, {state.smallest_jacobian:.3g} at its worst, and a stretch "
-            f"of {stretch:.3g}"
-        )
+            f"{'hexahedron' if hexahedron else 'support domain'} {number} ({rows.materials[material].name}) at "
+            f"({x:.1f}, {y:.1f}, {z:.1f}) mm on rank {self.world.rank}"
+        ), local

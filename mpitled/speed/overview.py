@@ -120,7 +120,7 @@ def _tumour(tumour: Tumour, mesh: Mesh, *, x_is_right: bool) -> Item:
     side = "" if abs(across) < _MIDDLE else "right" if across > 0 else "left"
     told = [*ventricles[:1], *(name for name in preprocess.OUTER if name in apart)]
     text = f"{in_millimetres(centre)}{side and f', {side} of the middle'}"
-    text += f"; {1e9 * tumour.volume:g} mm3, radius {1e3 * tumour.seed_radius:g} -> {length(radius)}"
+    text += f"; {1e9 * tumour.volume:.10g} mm3, radius {1e3 * tumour.seed_radius:g} -> {length(radius)}"
     if told:
         text += "; " + ", ".join(f"{length(apart[name])} from the {name.replace('_', ' ')}" for name in told)
     figures = {
@@ -169,7 +169,7 @@ def _file_checks(file: MeshFile) -> Iterator[str]:
         section = MeshFiles(fe=file.path)
         mesh = meshes.assemble(section, file, None)
         deck = Deck(mesh=section, path=file.path)
-        dofs = preprocess.prescribe(deck, mesh)[0] if mesh.constraints else np.empty(0, np.int64)
+        dofs = preprocess.prescribe(deck, mesh)[0].dofs if mesh.constraints else np.empty(0, np.int64)
         yield from mesh.remarks
         none = np.empty((0, 8), np.int64)
         said = checks.scene_remarks(mesh.points, mesh.hexahedra, none, mesh.n_fe_nodes, dofs)

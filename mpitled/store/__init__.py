@@ -8,7 +8,7 @@ from mpitled.store.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from mpitled.store.columns import read_grid, write_columns
+from mpitled.store.columns import read_grid, table_contents, write_columns
 from mpitled.store.files import check_hdf5, has_mpi, hdf5_version, read_rows
 from mpitled.store.models import (
     MODEL_ARRAYS,
@@ -33,12 +33,13 @@ from mpitled.store.partitions import (
     read_part,
     write_partition,
 )
-from mpitled.store.results import Result, is_finished, is_result, is_unfinished, open_result, unfinished_bytes
+from mpitled.store.results import EFG_NODE, Result, is_finished, is_result, is_unfinished, open_result, unfinished_bytes
 from mpitled.store.writer import ResultWriter, result_bytes
 
 __all__ = [
     "BLOCK",
     "CHECKPOINTS",
+    "EFG_NODE",
     "MODEL_ARRAYS",
     "PartRows",
     "Result",
@@ -71,6 +72,7 @@ __all__ = [
     "read_scene",
     "read_sets",
     "result_bytes",
+    "table_contents",
     "unfinished_bytes",
     "write_checkpoint",
     "write_columns",

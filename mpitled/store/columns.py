@@ -26,6 +26,22 @@ def write_columns(path: Path, groups: Mapping[str, Mapping[str, Sequence[float |
                 group.create_dataset(column, data=data, dtype=h5py.string_dtype() if text else None)
 
 
+def table_contents(path: Path) -> dict[str, dict[str, Any]]:
+    """Columns and number of rows of each table, by name; empty if the HDF5 file is not of tables alone."""
+    with open_file(path) as file, damaged(path, "make it anew"):
+        vet.check_file(file, path)
+        tables = {}
+        for name, group in file.items():
+            columns = dict(group) if isinstance(group, h5py.Group) else {}
+            if not all(isinstance(item, h5py.Dataset) and len(item.shape or ()) == 1 for item in columns.values()):
+                return {}
+            lengths = {len(item) for item in columns.values()}
+            if len(lengths) != 1:
+                return {}
+            tables[name] = {"columns": list(columns), "rows": lengths.pop()}
+        return tables
+
+
 def read_grid(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Places (n, 3) and volumes (n,) of a grid of integration points: datasets x, y, z, volume at the file's top."""
     with open_file(path) as file, damaged(path, "write it anew"):

@@ -48,7 +48,8 @@ def open_file(path: Path) -> h5py.File:
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file") from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be read as HDF5 ({str(error).splitlines()[0]})") from None
+        reason = "it is cut short" if "truncated" in str(error) else str(error).splitlines()[0]
+        raise InputError(f"{path}: cannot be read as HDF5 ({reason}); make it anew, or give another file") from None
 
 
 def attribute(holder: h5py.Group, name: str) -> str | int | None:
