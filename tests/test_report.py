@@ -118,6 +118,37 @@ def test_affine_motion_changes_volumes_by_its_determinant(tmp_path):
     assert max(made["max_displacement_of_ventricle_wall_mm"].values()) == pytest.approx(largest, rel=1e-13)
 
 
+def test_the_midline_shifts_towards_the_side_that_is_named_right(tmp_path):
+    """u_x = 0.1 x, and more beyond what lies between the ventricles: cells 2 and 7 of ten along x, 3 mm each."""
+    model = model_of(tmp_path, SHEAR, cloud="none")
+    middle = model.points[model.hexahedra].mean(axis=1)
+    low, high = middle[:, 1:].min(axis=0), middle[:, 1:].max(axis=0)
+    inside = ((middle[:, 1:] > low + 1e-6) & (middle[:, 1:] < high - 1e-6)).all(axis=1)
+    at = {x: np.flatnonzero(inside & (np.abs(middle[:, 0] - x) < 1e-6)) for x in (7.5e-3, 22.5e-3)}
+    assert all(map(len, at.values()))
+
+    def move(X):
+        outside = (X[:, 1:] < low + 1e-3) | (X[:, 1:] > high - 1e-3)
+        return np.column_stack([0.1 * X[:, 0] + 1e-2 * outside.any(axis=1), 0 * X[:, 0], 0 * X[:, 0]])
+
+    for sides, sign in (((7.5e-3, 22.5e-3), 1), ((22.5e-3, 7.5e-3), -1)):
+        sets = dict(zip(("left_ventricle", "right_ventricle"), map(at.get, sides), strict=True))
+        made = report.compute(outcome_of(replace(model, cell_sets=model.cell_sets | sets), move))
+        assert made["midline_shift_mm"] == pytest.approx(sign * 1.5, rel=1e-12)
+
+
+def test_crushed_cells_are_counted_and_the_worst_is_named(tmp_path):
+    model = model_of(tmp_path, SHEAR, cloud="none")
+    jacobian = np.ones(model.n_cells)
+    jacobian[[3, 8]] = 0.4, 0.1
+    made = report.compute(replace(outcome_of(model, lambda X: 0 * X), jacobian=jacobian))
+    volume = 1e9 * hexahedra.volumes(model.points, model.hexahedra[[3, 8]]).sum()
+    assert made["crushed"] == {"cells": 2, "volume_mm3": pytest.approx(volume, rel=1e-13)}
+    worst = made["smallest_jacobian"]
+    assert (worst["now"], worst["cell"], worst["material"]) == (0.1, "hexahedron", "brain")
+    np.testing.assert_allclose(worst["place_mm"], 1e3 * model.points[model.hexahedra[8]].mean(axis=0), rtol=1e-13)
+
+
 def test_share_that_moved_far(tmp_path):
     """u_x = 0.4 x on 10 cells of 3 mm: beyond 5 mm is x > 12.5 mm, six cells of ten and six nodes of eleven."""
     model = model_of(tmp_path, SHEAR, cloud="none")

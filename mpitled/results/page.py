@@ -84,9 +84,9 @@ def _page(directory: Path, made: Mapping[str, Any]) -> str:
 def _head(run: _Run) -> Iterator[str]:
     made, versions = run.report, run.outcome.metadata["versions"]
     method = {
-        "quasi-static": "slow loading",
+        "quasi-static": "a quasi-static ramp",
         "dynamic-relaxation": "dynamic relaxation to the static solution",
-        "dynamic": "dynamics with the true masses",
+        "dynamic": "dynamics, with the true masses",
     }[run.deck["solver"]["method"]]
     ranks = run.outcome.metadata["ranks"]
     yield markup.text(
@@ -102,17 +102,22 @@ def _head(run: _Run) -> Iterator[str]:
 
 
 def _cards(made: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    yield "largest displacement", f"{made['max_displacement_mm']:.2f} mm"
     if walls := made.get("max_displacement_of_ventricle_wall_mm"):
         yield "largest displacement of a ventricle's wall", f"{max(walls.values()):.2f} mm"
+    else:
+        yield "largest displacement", f"{made['max_displacement_mm']:.2f} mm"
+    if (shift := made.get("midline_shift_mm")) is not None:
+        yield "shift of the midline, to the " + ("right" if shift > 0 else "left"), f"{abs(shift):.2f} mm"
     if change := made.get("ventricle_volume_change_ml"):
         yield "change of the ventricles", f"{change['total']:+.3f} ml"
     if volume := made.get("tumour_volume_mm3"):
         yield "tumour as reached", f"{volume:.1f} mm\u00b3"
     if (smallest := made.get("min_jacobian")) is not None:
-        yield "smallest J", f"{smallest:.3f}"
+        yield "smallest J, a cell's volume over its undeformed volume", f"{smallest:.3f}"
+    if (misfit := made.get("cloud_misfit_mm")) is not None:
+        yield "uncertainty of the cloud, at its worst node", f"{misfit:.2f} mm"
     if (distance := made.get("static_distance_mm")) is not None:
-        yield "from the static solution, by the run's own estimate", f"{distance:.2g} mm"
+        yield "still to move to the static solution, by the run's own estimate", f"{distance:.2g} mm"
 
 
 # --- the sections: HTML, part by part; nothing where a scene has nothing of it ---------------------------------------

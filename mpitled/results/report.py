@@ -31,6 +31,8 @@ LARGE = 5e-3
 #: have had up to 0.15, wrong ones from 0.3); a wrong volume balance; a distance to the static solution, and a misfit of
 #: the cloud, mm.
 ARTIFICIAL, UNBALANCED, FAR = 0.2, 0.05, 0.5
+#: Poisson's ratios above this are nearly incompressible; cells below this J have lost much.
+INCOMPRESSIBLE, CRUSHED = 0.495, 0.5
 VENTRICLES = {"left": "left_ventricle", "right": "right_ventricle"}
 #: Exact to degree 3 in each coordinate; a bilinear face's volume integrand has degree 2.
 _GAUSS = (-(3**-0.5), 3**-0.5)
@@ -90,8 +92,9 @@ def write(directory: Path, seconds: Mapping[str, float] | None = None) -> dict[s
     outcome = read(directory)
     report = compute(outcome)
     report["pictures"] = _draw(outcome, directory)
+    # Of a report that is made again the run knows nothing.
     phases = dict(seconds or report.get("seconds", {}))
-    report["seconds"] = phases | {"report": time.perf_counter() - begin}
+    report["seconds"] = phases | {"report": phases.get("report", time.perf_counter() - begin)}
     report = _without_nan(report)
     atomic.write_text(directory / REPORT, json.dumps(report, indent=2, allow_nan=False) + "\n")
     return report
@@ -150,11 +153,13 @@ def compute(outcome: Outcome) -> dict[str, Any]:
     report |= _ventricles(outcome, fe_volumes)
     if outcome.centre is not None and len(outcome.seed):
         report |= _tumour(outcome, outcome.centre)
-    report |= outcome.figures
+    report |= _smallest(outcome, volumes) | outcome.figures
     if solver := outcome.metadata.get("deck", {}).get("solver"):
         report["method"] = solver["method"]
+        if solver["method"] == "dynamic-relaxation":  # whose time is fictitious
+            report.pop("time_step_s", None)
     # What there is of a run that was stopped is not taken for a result, and its figures are off for that reason.
-    report["warnings"] = [*model.warnings, *(_warnings(report) if outcome.complete else ())]
+    report["warnings"] = [*model.warnings, *(_warnings(report, model) if outcome.complete else ())]
     return report
 
 
@@ -163,16 +168,20 @@ def unfound(balance: Mapping[str, float]) -> float:
     return balance["tumour_added_mm3"] - balance["pushed_through_interface_mm3"] - balance["elastic_compression_mm3"]
 
 
-def _warnings(report: Mapping[str, Any]) -> list[str]:
+def _warnings(report: Mapping[str, Any], model: Model) -> list[str]:
     """Why a result may not be what it seems, and the remedy."""
     found = []
+    relaxed = report.get("method") == "dynamic-relaxation"
     energy = report.get("energy_J", {})
     if energy.get("internal", 0) > 0:
         share = (energy["hourglass"] + energy["stabilisation"]) / energy["internal"]
         if share > ARTIFICIAL:
+            # What resists these modes is a share of lambda + 2 mu, which has no bound towards 0.5.
+            stiff = max(material.poissons_ratio for material in model.materials) > INCOMPRESSIBLE
+            remedy = "lower material.NAME.poissons_ratio (0.49)" if stiff else "raise support.stabilisation"
             found.append(
                 f"{share:.0%} of the internal energy is in modes that no cell's strain sees, so the displacements are "
-                "not to be trusted: refine the mesh or the cloud, or raise support.stabilisation"
+                f"not to be trusted: refine the mesh or the cloud, or {remedy}"
             )
     balance = report.get("volume_balance", {})
     if (error := balance.get("relative_error", 0.0)) > UNBALANCED:
@@ -186,9 +195,10 @@ def _warnings(report: Mapping[str, Any]) -> list[str]:
             f"it there ({keys})"
         )
     if (distance := report.get("static_distance_mm", 0.0)) > FAR:
+        remedy = 'load more slowly (solver.load_time), or take solver.method = "dynamic-relaxation"'
         found.append(
-            f"the ramp ended {distance:.2g} mm from the static solution: load more slowly (solver.load_time), or take "
-            'solver.method = "dynamic-relaxation"'
+            f"the run ended {distance:.2g} mm from the static solution: "
+            f"{'lower solver.tolerance' if relaxed else remedy}"
         )
     elif report.get("method") == "quasi-static" and "static_distance_mm" not in report:
         found.append(
@@ -267,6 +277,47 @@ def _ventricles(outcome: Outcome, fe_volumes: NDArray[np.float64]) -> dict[str, 
         "ventricle_volume_ml": before | {"total": sum(before.values())},
         "ventricle_volume_change_ml": change | {"total": sum(change.values())},
         "max_displacement_of_ventricle_wall_mm": wall,
+        **({"midline_shift_mm": shift} if (shift := _midline_shift(outcome, fe_volumes)) is not None else {}),
+    }
+
+
+def _midline_shift(outcome: Outcome, fe_volumes: NDArray[np.float64]) -> float | None:
+    """How far what lies between the ventricles moves across the midline, mm: the largest, above 0 to the right.
+
+    The midline's plane halves the way between the ventricles' middles and is normal to it. Of the nodes within half a
+    hexahedron of it those count that lie as far front and back, up and down as the ventricles do. None without two.
+    """
+    model = outcome.model
+    walls = [model.cell_sets.get(name, np.empty(0, np.int64)) for name in VENTRICLES.values()]
+    if not all(map(len, walls)):
+        return None
+    nodes = [np.unique(model.hexahedra[cells[cells < len(model.hexahedra)]]) for cells in walls]
+    left, right = (model.points[of].mean(axis=0) for of in nodes)
+    across = (right - left) / np.linalg.norm(right - left)
+    from_plane = model.points @ across - (left + right) @ across / 2
+    # Where they lie, seen along the way across.
+    flat = model.points - np.outer(model.points @ across, across)
+    both = flat[np.concatenate(nodes)]
+    between = ((flat >= both.min(axis=0)) & (flat <= both.max(axis=0))).all(axis=1)
+    near = np.abs(from_plane) <= float(np.cbrt(fe_volumes.mean())) / 2
+    shifts = (outcome.field @ across)[between & near]
+    return 1e3 * float(shifts[np.abs(shifts).argmax()]) if len(shifts) else None
+
+
+def _smallest(outcome: Outcome, volumes: NDArray[np.float64]) -> dict[str, Any]:
+    """Where J is smallest in the last frame, and how much of the body is in cells that lost much of their volume."""
+    model, jacobian = outcome.model, outcome.jacobian
+    cell, n = int(np.argmin(jacobian)), len(model.hexahedra)
+    place = model.points[model.hexahedra[cell]].mean(axis=0) if cell < n else model.domain_points[cell - n]
+    crushed = jacobian < CRUSHED
+    return {
+        "smallest_jacobian": {
+            "now": float(jacobian[cell]),
+            "cell": "hexahedron" if cell < n else "support domain",
+            "material": model.materials[model.material[cell]].name,
+            "place_mm": (1e3 * place).tolist(),
+        },
+        "crushed": {"cells": int(crushed.sum()), "volume_mm3": 1e9 * float(volumes[crushed].sum())},
     }
 
 
@@ -344,6 +395,7 @@ _LINES = (
     ("max_displacement_outside_first_ring_mm", "outside the tumour's first ring of cells", "{:.2f} mm"),
     ("max_displacement_of_ventricle_wall_mm", "largest, ventricle walls", "{:.2f} mm"),
     ("share_over_5mm", "moved more than 5 mm", "{:.2%}"),
+    ("midline_shift_mm", "shift of the midline between the ventricles", "{:+.2f} mm (+: to the right)"),
     ("ventricle_volume_ml", "ventricles, undeformed", "{:.3f} ml"),
     ("ventricle_volume_change_ml", "ventricles, change", "{:+.3f} ml"),
     ("tumour_volume_mm3", "tumour as reached", "{:.1f} mm3"),
@@ -352,9 +404,10 @@ _LINES = (
     ("volume_balance.pushed_through_interface_mm3", "pushed through the interface", "{:.1f} mm3"),
     ("volume_balance.elastic_compression_mm3", "compression of the cloud", "{:.1f} mm3"),
     ("volume_balance.relative_error", "volume balance, error", "{:.2%}"),
-    ("cloud_misfit_mm", "misfit of the cloud, largest", "{:.3f} mm"),
+    ("cloud_misfit_mm", "uncertainty of the cloud, worst node", "{:.3f} mm"),
     ("static_distance_mm", "from the static solution, by its own estimate", "{:.2g} mm"),
-    ("min_jacobian", "smallest J", "{:.4f}"),
+    ("min_jacobian", "smallest J, a cell's volume over undeformed", "{:.4f}"),
+    ("crushed.volume_mm3", "in cells below J = 0.5", "{:.3g} mm3"),
     ("energy_J.external", "external work", "{:.4g} J"),
     ("energy_J.internal", "internal energy", "{:.4g} J"),
     ("energy_J.kinetic", "kinetic energy", "{:.4g} J"),
@@ -375,8 +428,9 @@ _LINES = (
     ("seconds", "run time, by phase", "{:.1f} s"),
 )
 _HEADLINES = {
-    "max_displacement_mm", "max_displacement_of_ventricle_wall_mm", "ventricle_volume_change_ml", "tumour_volume_mm3",
-    "volume_balance.relative_error", "cloud_misfit_mm", "static_distance_mm", "min_jacobian", "steps", "run_s",
+    "max_displacement_mm", "max_displacement_of_ventricle_wall_mm", "midline_shift_mm", "ventricle_volume_change_ml",
+    "tumour_volume_mm3", "volume_balance.relative_error", "cloud_misfit_mm", "static_distance_mm", "min_jacobian",
+    "crushed.volume_mm3", "steps", "run_s",
 }  # fmt: skip
 #: Lines of relaxation alone, and those that mean nothing there, where masses and time are fictitious.
 _OF_RELAXATION = {"energy_J.dissipated"}
