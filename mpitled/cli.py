@@ -18,7 +18,7 @@ from mpitled import arguments
 from mpitled.errors import InputError, MpitledError
 
 if TYPE_CHECKING:
-    from mpitled.batch.cases import Sweep
+    from mpitled.batch.cases import Case, Sweep
 
 # Modules are imported by the command that needs them: `--help` must not wait for compilers and libraries.
 
@@ -114,6 +114,7 @@ def _run(options: argparse.Namespace) -> None:
         if world.leads:
             print(told)
         return
+    world.on_leader(lambda: _refuse_sweep(_output(options)))
     for which in INTERRUPTS:  # what comes after the end of the run must not make a failure of it
         signal.signal(which, signal.SIG_IGN)
     made = run(deck, _output(options), world, quiet=options.quiet, resume=options.resume)
@@ -126,6 +127,14 @@ def _run(options: argparse.Namespace) -> None:
         _print(made, partial(report.table, whole=options.verbose), options)
         if not options.json:
             print(f"written to {_output(options)}; mpitled report {_output(options)} --html makes a page of it")
+
+
+def _refuse_sweep(folder: Path) -> None:
+    """InputError for the folder of a sweep, whose table a run would hide."""
+    from mpitled.batch.cases import is_sweep
+
+    if is_sweep(folder):
+        raise InputError(f"{folder}: is the folder of a sweep; give another --out")
 
 
 def _sweep(options: argparse.Namespace) -> int:
@@ -148,13 +157,30 @@ def _sweep(options: argparse.Namespace) -> int:
         if plan.one_growth and (options.scheduler or options.only):
             raise InputError("--one-growth: is one run, and no array of jobs; leave out --scheduler and --only")
     if options.scheduler:
+        path = world.on_leader(lambda: sweep.array_job(plan, options.scheduler))
         if world.leads:
-            print(sweep.array_job(plan, options.scheduler))
+            print(json.dumps({"script": str(path)}) if options.json else path)
         return 0
     sweep.compute(plan, world, jobs=options.jobs, retry=options.retry, only=options.only)
+    if options.only:
+        return int(world.on_leader(lambda: _tell_case(plan, plan.cases[options.only - 1], options)))
     if plan.one_growth and world.leads:
         growth.tell(plan)
-    return _tabulate(plan, options) if world.leads and not options.only else 0
+    return _tabulate(plan, options) if world.leads else 0
+
+
+def _tell_case(plan: Sweep, case: Case, options: argparse.Namespace) -> int:
+    """What became of a case by itself; 3 if it is broken."""
+    from dataclasses import replace
+
+    from mpitled.batch import summary
+
+    if options.json:
+        (record,) = summary.records(summary.collect(replace(plan, cases=(case,))))
+        print(json.dumps(record, indent=2))
+    if case.failure:
+        print(f"mpitled: case {case.number}, {case.words}: {case.failure}", file=sys.stderr)
+    return 3 if case.failure else 0
 
 
 def _tabulate(plan: Sweep, options: argparse.Namespace) -> int:

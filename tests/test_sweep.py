@@ -20,7 +20,7 @@ import pytest
 from conftest import ENVIRONMENT, ROOT, complaint, mpitled
 from scenes import TUMOUR, block, pulled
 
-from mpitled import open_sweep
+from mpitled import lock, open_sweep
 from mpitled.batch import cases, screen, summary, vary
 from mpitled.batch import sweep as array
 from mpitled.errors import InputError
@@ -269,6 +269,76 @@ def test_two_sweeps_do_not_work_in_one_folder(tmp_path):
         fcntl.flock(held, fcntl.LOCK_EX)
         done = mpitled("sweep", CUBE, "--vary", "solver.load_steps=5", "--out", tmp_path / "out", status=2)
     assert "another sweep is at work" in done.stderr
+
+
+def test_two_processes_do_not_compute_one_case(tmp_path):
+    """Be it a task that is submitted again, a sweep, a run or a study: what is at work keeps its folder."""
+    pytest.importorskip("fcntl")
+    out, study = tmp_path / "out", tmp_path / "study"
+    keys = ["block.elements=[2,2,2]", "solver.method=dynamic-relaxation"]
+    plan = cases.plan(CUBE, vary.grid(["solver.load_steps=400,500"]), keys, 1, out)
+    plan.write_manifest()
+    busy, free = plan.cases
+    for name in (lock.RUN, lock.TASK):
+        busy.folder.mkdir(exist_ok=True)
+        (busy.folder / "precious").touch()
+        with lock.held(busy.folder, name):
+            for words in (["--only", "1"], []):
+                line = complaint(mpitled("sweep", out, *words, status=2))
+                assert f"{busy.folder}: another run is at work there" in line
+                assert (busy.folder / "precious").exists()
+                assert busy.failure is None
+            complaint(mpitled("sweep", out, n=2, status=2))
+        assert free.failure == ""
+        shutil.rmtree(free.folder)
+    with lock.held(busy.folder, lock.RUN):
+        for n in (1, 2):
+            line = complaint(mpitled("run", CUBE, "--out", busy.folder, n=n, status=2))
+            assert "another run is at work there; wait for its end, or give another --out" in line
+    words = ["study", CUBE, "--out", study, *(word for key in keys for word in ("--set", key))]
+    mpitled(*words)
+    folder = next(study.glob("as*"))
+    (folder / "done.json").unlink()
+    with lock.held(folder, lock.RUN):
+        assert "another run is at work" in complaint(mpitled(*words, status=2))
+    assert (folder / "result.vtkhdf").exists()
+
+    command = [str(Path(sys.executable).with_name("mpitled")), "sweep", str(out), "--only", "1"]
+    twice = [subprocess.Popen(command, env=ENVIRONMENT, cwd=ROOT, stderr=subprocess.DEVNULL) for _ in range(2)]
+    assert sorted(process.wait(60) for process in twice) in ([0, 2], [0, 0])  # or the second finds it done
+    assert busy.failure == ""
+    assert json.loads((busy.folder / "report.json").read_text())["load_share"] == 1
+
+
+def test_a_task_says_how_its_case_ended(tmp_path):
+    out = tmp_path / "out"
+    mpitled(*WORDS, "--out", out, "--scheduler", "slurm")
+    line = complaint(mpitled("sweep", out, "--only", 3, status=3))
+    assert "case 3, solver.load_steps=1: unstable" in line
+    done = mpitled("sweep", out, "--only", 3, "--json", status=3)  # not computed again
+    assert "unstable" in json.loads(done.stdout)["failure"]
+    assert json.loads(mpitled("sweep", out, "--only", 1, "--json").stdout)["max_displacement_mm"] > 0
+    done = mpitled(*WORDS, "--out", out, "--scheduler", "pbs", "--json")
+    assert json.loads(done.stdout) == {"script": str(out / "pbs.sh")}
+
+
+def test_runs_and_sweeps_do_not_hide_each_other(tmp_path):
+    sweep, run = tmp_path / "sweep", tmp_path / "run"
+    cases.plan(CUBE, vary.grid(["solver.load_steps=400"]), [], 1, sweep).write_manifest()
+    run.mkdir()
+    (run / "model.h5").touch()
+    assert f"{sweep}: is the folder of a sweep" in complaint(mpitled("run", CUBE, "--out", sweep, status=2))
+    for words in ([], ["--scheduler", "slurm"]):
+        line = complaint(mpitled(*WORDS, "--out", run, *words, status=2))
+        assert f"{run}: is the folder of a run" in line
+
+
+@pytest.mark.parametrize("words", [[], ["--scheduler", "slurm"], ["--only", "1"], ["study"]])
+def test_a_folder_that_cannot_be_made_is_said_in_a_line(tmp_path, words):
+    (tmp_path / "file").touch()
+    out = tmp_path / "file" / "out"
+    command = ["study", *WORDS[1:]] if words == ["study"] else [*WORDS, *words]
+    assert f"{out}: cannot be made" in complaint(mpitled(*command, "--out", out, status=2))
 
 
 def test_another_sweep_does_not_take_the_place_of_a_table(tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
 import secrets
@@ -12,12 +11,12 @@ import signal
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import NoReturn
 
+from mpitled import atomic, lock, store
 from mpitled import deck as decks
-from mpitled import store
 from mpitled.batch import launch
 from mpitled.batch.cases import Case, Sweep, is_sweep
 from mpitled.batch.screen import Screen, share_done
@@ -33,11 +32,17 @@ def compute(sweep: Sweep, world: World, *, jobs: int = 1, retry: bool = False, o
 
     On one rank `jobs` cases are at work at once, each on `sweep.ranks` ranks of its own. On many ranks groups of
     `sweep.ranks` take the cases. `only` is the number of the one case to compute, as array jobs do.
-    InputError alike on all ranks if the numbers do not fit each other; InterruptedRun if it is ended from outside.
+    InputError alike on all ranks if the numbers do not fit each other, or if a case is left to another process that is
+    at work on it; InterruptedRun if it is ended from outside.
     """
     with everywhere():
         if world.size > 1 and world.size % sweep.ranks:
             raise InputError(f"--ranks {sweep.ranks}: {world.size} ranks are no whole groups of it; start a multiple")
+        if only is not None and world.started and world.size != sweep.ranks:
+            raise InputError(
+                f"--only {only}: has {_count(sweep.ranks, 'rank')} a case, and {world.size} started; start as many, or "
+                "write the array job anew with --scheduler"
+            )
         if only is not None and not 0 < only <= len(sweep.cases):
             raise InputError(f"--only {only}: there are {len(sweep.cases)} cases; count them from 1")
     cases = [case for case in sweep.runs if only is None or case.number == only]
@@ -54,6 +59,13 @@ def compute(sweep: Sweep, world: World, *, jobs: int = 1, retry: bool = False, o
             _in_groups(sweep, models, todo, world, sweep.folder / f".claims-{token}")
         else:
             _as_processes(sweep, models, todo, jobs)
+        world.on_leader(lambda: _refuse_to_wait(todo))
+
+
+def _refuse_to_wait(todo: Sequence[Case]) -> None:
+    """InputError if a case was left to another process and is not done yet."""
+    if left := [case for case in todo if case.failure is None]:
+        raise InputError(f"{left[0].folder}: another run is at work there; give the command again when it has ended")
 
 
 def _begin(sweep: Sweep, cases: Sequence[Case], n_open: int, at_once: int) -> None:
@@ -68,7 +80,9 @@ def _to_do(cases: Sequence[Case], retry: bool) -> list[Case]:
     """Cases that have not ended, or (retry) are broken: these are open again from now on."""
     todo = [case for case in cases if case.failure is None or (retry and case.failure)]
     for case in todo:
-        (case.folder / launch.DONE).unlink(missing_ok=True)
+        if case.failure:
+            with atomic.writing(case.folder / launch.DONE):
+                (case.folder / launch.DONE).unlink()
     return todo
 
 
@@ -80,29 +94,18 @@ def _is_built(case: Case, ranks: int) -> bool:
 @contextmanager
 def _alone(sweep: Sweep, world: World, only: int | None) -> Iterator[None]:
     """The folder for this sweep alone, if its file system has locks; tasks of an array job are at work together."""
-    held = []
+    with ExitStack() as alone:
 
-    def lock() -> None:
-        if only is not None and is_sweep(sweep.folder):
-            return  # other tasks read the manifest
-        sweep.folder.mkdir(parents=True, exist_ok=True)
-        held.append((sweep.folder / ".lock").open("w"))
-        try:
-            fcntl.flock(held[0], fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"{sweep.folder}: another sweep is at work there; wait for its end") from None
-        except OSError:
-            pass
-        sweep.write_manifest()
-        for stale in sweep.folder.glob(".claims-*"):
-            shutil.rmtree(stale, ignore_errors=True)
+        def begin() -> None:
+            if only is not None and is_sweep(sweep.folder):
+                return  # other tasks read the manifest
+            alone.enter_context(lock.held(sweep.folder, lock.RUN, "sweep"))
+            sweep.write_manifest()
+            for stale in sweep.folder.glob(".claims-*"):
+                shutil.rmtree(stale, ignore_errors=True)
 
-    try:
-        world.on_leader(lock)
+        world.on_leader(begin)
         yield
-    finally:
-        for file in held:
-            file.close()
 
 
 # --- on a workstation ----------------------------------------------------------------------------------------------
@@ -111,6 +114,7 @@ def _alone(sweep: Sweep, world: World, only: int | None) -> Iterator[None]:
 def _as_processes(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], jobs: int) -> None:
     """A process for each case, so many at once; first the models that several cases share."""
     screen, working = Screen(), dict[Case, launch.Process]()
+    alone = {case: ExitStack() for case in todo}
     ends = (signal.SIGTERM, signal.SIGUSR1)
     previous = [signal.signal(which, signal.default_int_handler) for which in ends]
     try:
@@ -119,14 +123,22 @@ def _as_processes(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], jo
             while waiting or working:
                 while waiting and len(working) < jobs:
                     case = waiting.pop(0)
-                    working[case] = _start(sweep, case, verb)
                     if verb == "build":
+                        launch.prepare(case.model)
+                        working[case] = _start(sweep, case, verb, case.model)
                         screen.tell(f"model of case {case.number} and others")
-                next(iter(working.values())).ended(_WATCH)
+                    elif (resume := _prepare(case, alone[case])) is not None:
+                        working[case] = _start(sweep, case, verb, case.folder, resume)
+                    else:
+                        alone[case].close()
+                for process in list(working.values())[:1]:
+                    process.ended(_WATCH)
                 for case in [case for case, process in working.items() if process.ended(0)]:
                     process = working.pop(case)
-                    if verb == "run":  # what a model lacks is said by the cases that cannot build it either
+                    # What a model lacks is said by the cases that cannot build it either.
+                    if verb == "run" and not process.failure.endswith(lock.REMEDY):
                         _end(sweep, case, process.failure, screen)
+                    alone[case].close()
                 shares = {case.words: share_done(launch.said(process.folder)) for case, process in working.items()}
                 screen.show(shares, len(waiting))
     except KeyboardInterrupt:
@@ -135,28 +147,33 @@ def _as_processes(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], jo
     finally:
         for process in working.values():
             process.stop()
+        for held in alone.values():
+            held.close()
         for which, handler in zip(ends, previous, strict=True):
             signal.signal(which, handler)
 
 
-def _start(sweep: Sweep, case: Case, verb: str) -> launch.Process:
-    if verb == "build":
-        launch.prepare(case.model)
-        folder, resume = case.model, False
-    else:
-        folder, resume = case.folder, _prepare(case)
+def _start(sweep: Sweep, case: Case, verb: str, folder: Path, resume: bool = False) -> launch.Process:
     return launch.Process(launch.command(verb, sweep.deck, case.overrides, sweep.ranks, folder, resume), folder)
 
 
-def _prepare(case: Case) -> bool:
-    """Make a case's folder ready; whether it goes on from the checkpoint that an interrupted run left in it."""
-    if case.failure is None:
+def _prepare(case: Case, alone: ExitStack) -> bool | None:
+    """Make a case's folder ready, and its own until `alone` is closed; whether it goes on from a checkpoint in it.
+
+    None if the case is another process's, which is at work on it or has ended by now.
+    """
+    try:
+        alone.enter_context(lock.held(case.folder, lock.TASK))
+        if case.failure is not None:
+            return None
         try:
             if checkpoint.find(case.folder, case.deck, decks.model_key(case.deck, job.included(case.deck))):
                 return True
         except InputError:  # of another program or model, or damaged: begun anew
             pass
-    launch.prepare(case.folder, case.model / job.MODEL if case.shares else None)
+        launch.prepare(case.folder, case.model / job.MODEL if case.shares else None)
+    except lock.Taken:
+        return None
     return False
 
 
@@ -180,8 +197,11 @@ def _in_groups(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], world
     world.barrier()
     screen = Screen()
     for case in todo:
-        if group.broadcast(group.leads and _claim(claims / case.folder.name)):
-            _run(sweep, case, group, screen, world)
+        with ExitStack() as alone:
+            mine = group.leads and _claim(claims / case.folder.name)
+            resume = group.broadcast(_prepare(case, alone) if mine else None)
+            if resume is not None:
+                _run(sweep, case, group, screen, world, resume)
     world.barrier()
     world.on_leader(lambda: shutil.rmtree(claims, ignore_errors=True))
 
@@ -204,15 +224,16 @@ def _build(sweep: Sweep, case: Case) -> None:
         pass
 
 
-def _run(sweep: Sweep, case: Case, group: World, screen: Screen, world: World) -> None:
+def _run(sweep: Sweep, case: Case, group: World, screen: Screen, world: World, resume: bool) -> None:
     """Compute a case on a group's ranks; its error ends the case alone if all of the group know of it."""
-    resume = bool(group.broadcast(group.leads and _prepare(case)))
     failure = ""
     with _logged(case.folder / launch.LOG if group.leads else Path(os.devnull)):
         try:
             job.run(case.deck, case.folder, group, resume=resume)
         except InterruptedRun as error:
             _abandon(world, error)
+        except lock.Taken:
+            return
         except Exception as error:
             if not isinstance(error, MpitledError):
                 traceback.print_exc()

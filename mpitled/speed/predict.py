@@ -63,7 +63,7 @@ def predict(path: Path, counts: Sequence[int], cluster: Cluster, out: Path, seed
         # METIS bisects: each of its earlier parts is what the finer parts in a row make up.
         tables = partition.tables(hexahedra, domains, finer[1] // (finer[0] // n_parts), n_parts)
         rows.insert(0, step_time(partition.figures(tables, costs, len(hexahedra)), cluster))
-    out.mkdir(parents=True, exist_ok=True)
+    atomic.make_folder(out)
     written = [{k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows]
     atomic.write_csv(out / "predict.csv", COLUMNS, written)
     try:
