@@ -18,7 +18,7 @@ from mpitled import arguments
 from mpitled.errors import InputError, MpitledError
 
 if TYPE_CHECKING:
-    from mpitled.batch.cases import Case, Sweep
+    from mpitled.batch.cases import Case, Sweep, Told
 
 # Modules are imported by the command that needs them: `--help` must not wait for compilers and libraries.
 
@@ -166,7 +166,7 @@ def _sweep(options: argparse.Namespace) -> int:
         return int(world.on_leader(lambda: _tell_case(plan, plan.cases[options.only - 1], options)))
     if plan.one_growth and world.leads:
         growth.tell(plan)
-    return _tabulate(plan, options) if world.leads else 0
+    return _tabulate(plan, options, must=True) if world.leads else 0
 
 
 def _tell_case(plan: Sweep, case: Case, options: argparse.Namespace) -> int:
@@ -183,19 +183,28 @@ def _tell_case(plan: Sweep, case: Case, options: argparse.Namespace) -> int:
     return 3 if case.failure else 0
 
 
-def _tabulate(plan: Sweep, options: argparse.Namespace) -> int:
-    """Write and print the table of a sweep; 3 if a case is broken."""
+def _tabulate(told: Told, options: argparse.Namespace, *, must: bool) -> int:
+    """Print the table of a sweep, then write it; 3 if a case is broken. `must`: InputError if the disc refuses."""
     from mpitled.batch import summary
 
-    table = summary.collect(plan, options.beside)
-    summary.write(plan, table)
-    if options.json:
-        print(json.dumps(summary.records(table), indent=2))
+    table = summary.collect(told, options.beside)
+    print(json.dumps(summary.records(table), indent=2) if options.json else summary.text(table))
+    try:
+        summary.write(told, table)
+    except InputError as error:
+        if must:
+            raise
+        _note(error)
     else:
-        print(f"{summary.text(table)}\nwritten to {plan.folder}")
-    if broken := [case for case in plan.cases if case.failure]:
+        if not options.json:
+            print(f"written to {told.folder}")
+    if broken := [case for case in told.cases if case.failure]:
         print(f"{len(broken)} broken; --retry computes them again", file=sys.stderr)
     return 3 if broken else 0
+
+
+def _note(error: InputError) -> None:
+    print(f"note: {error}", file=sys.stderr)
 
 
 def _new(options: argparse.Namespace) -> None:
@@ -260,14 +269,19 @@ def _report(options: argparse.Namespace) -> int:
     from mpitled.results import report
 
     if cases.is_sweep(options.directory):
-        return _tabulate(cases.read(options.directory), options)
+        return _tabulate(cases.told(options.directory), options, must=False)
+    made = report.make(options.directory)
+    _print(made, report.table, options)
     if options.html:
         from mpitled.results import page
 
-        _print(page.write(options.directory), report.table, options)
-        print(f"written to {options.directory / page.PAGE}", file=sys.stderr)
+        report.keep(options.directory, made)
+        print(f"written to {page.write(options.directory, made)}", file=sys.stderr)
     else:
-        _print(report.write(options.directory), report.table, options)
+        try:
+            report.keep(options.directory, made)
+        except InputError as error:
+            _note(error)
     return 0
 
 

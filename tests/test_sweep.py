@@ -21,7 +21,7 @@ from conftest import ENVIRONMENT, ROOT, complaint, mpitled
 from scenes import TUMOUR, block, pulled
 
 from mpitled import lock, open_sweep
-from mpitled.batch import cases, screen, summary, vary
+from mpitled.batch import cases, launch, screen, summary, vary
 from mpitled.batch import sweep as array
 from mpitled.errors import InputError
 from mpitled.store import checkpoint_contents
@@ -160,12 +160,52 @@ def test_an_array_job_computes_each_task_alone(tmp_path, monkeypatch):
         assert "1-3\n" in script.read_text()
         assert "# 3 cases, each on 1 rank;" in script.read_text()
         assert ("srun --mpi=pmix" in script.read_text()) == (scheduler == "slurm")
+        assert f"export PATH={Path(sys.executable).parent}:$PATH" in script.read_text()
         task = {number: "2" if scheduler == "slurm" else "3"}
         subprocess.run([script], env=variables | task, check=True, timeout=120, stderr=subprocess.DEVNULL)
         (tmp_path / "sourced").unlink()
     out = tmp_path / "out"
     assert [case.failure for case in cases.read(out).cases] == [None, "", ""]
     assert mpitled("report", out).stdout.count("not computed") == 1
+
+
+def test_an_array_job_fits_its_sweep(tmp_path, monkeypatch):
+    """Number of ranks, logs beside a path's blanks, no script of another plan, and a program that is found."""
+    deck, out, spaced = tmp_path / "scene.toml", tmp_path / "out", tmp_path / "my 50% files"
+    deck.write_text(GROWTH)
+    words = ["sweep", deck, "--vary", "tumour.volume=150,300"]
+    mpitled(*words, "--out", out, "--scheduler", "pbs")
+    mpitled(*words, "--out", out, "--scheduler", "slurm")
+    assert (out / "pbs.sh").exists()
+    mpitled(*words, "--out", out, "--scheduler", "slurm", "--ranks", 2)
+    assert not (out / "pbs.sh").exists()
+    line = complaint(mpitled("sweep", out, "--only", 1, n=4, status=2))
+    assert "--only 1: has 2 ranks a case, and 4 started; start as many" in line
+    monkeypatch.setenv("OMPI_COMM_WORLD_SIZE", "1")
+    assert "and 1 started" in complaint(mpitled("sweep", out, "--only", 1, status=2))
+    monkeypatch.delenv("OMPI_COMM_WORLD_SIZE")
+
+    script = Path(mpitled(*words, "--out", spaced, "--scheduler", "slurm").stdout.strip())
+    log = f"{tmp_path}/my 50%% files/slurm-%A_%a.log"
+    assert f'#SBATCH --output="{log}"' in script.read_text()
+    assert "pbs takes no such path" in complaint(mpitled(*words, "--out", spaced, "--scheduler", "pbs", status=2))
+    # Submitted from any folder, by a shell that knows of no program.
+    monkeypatch.chdir(tmp_path)
+    plan = cases.plan(deck, vary.grid(["tumour.volume=150"]), [], 1, spaced)
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / "none"))
+    lines = [line for line in array.array_job(plan, "slurm").read_text().splitlines() if not line.startswith("#")]
+    begin = "\n".join(lines[: lines.index("launch=(srun --mpi=pmix)")])
+    shell = ["env", "-i", "PATH=/usr/bin:/bin", "bash", "-c", f"{begin}\ncommand -v mpitled"]
+    found = subprocess.run(shell, capture_output=True, text=True, check=True).stdout
+    assert found.strip() == str(Path(sys.executable).with_name("mpitled"))
+
+
+def test_a_reason_is_no_rule_of_a_banner(tmp_path):
+    """mpirun frames what it has to say."""
+    words = ["sh", "-c", "echo there are not enough slots; echo; echo ------; exit 1"]
+    process = launch.Process(words, tmp_path)
+    process.ended()
+    assert process.failure == "there are not enough slots"
 
 
 @pytest.mark.parametrize("scheduler", ["slurm", "pbs"])
@@ -363,8 +403,14 @@ def test_another_sweep_does_not_take_the_place_of_a_table(tmp_path):
         deck.write_text(text.replace("3000", "4000"))
         line = complaint(mpitled(*words, "--vary", f"{nu}=0.3,0.4,0.45", status=2))
         assert "of the deck before it or a file that it reads was changed" in line
-        if command == "sweep":
-            assert "was changed since" in complaint(mpitled("report", out / "sweep", status=2))
+        if command == "sweep":  # which can still be read
+            assert "was changed since" in complaint(mpitled("sweep", out / "sweep", status=2))
+            for change in (lambda: None, deck.unlink):
+                change()
+                done = mpitled("report", out / "sweep")
+                assert f"note: {out / 'sweep'}: {deck}, or a file that it reads, is not what was swept" in done.stderr
+                assert (out / command / table).read_bytes() == kept
+                assert [row[nu] for row in open_sweep(out / "sweep")] == [0.45, 0.4, 0.3]
         deck.write_text(text)
         assert (out / command / table).read_bytes() == kept
         (out / command / f"{command}.json").unlink()

@@ -71,7 +71,7 @@ def study(
     rows = []
     for i, (variant, folder) in enumerate(zip(todo, folders, strict=True), 1):
         if (failure := launch.outcome(folder)) is None:
-            print(f"{i}/{len(todo)}: {variant.family} {variant.value}", file=sys.stderr, flush=True)
+            print(f"{i}/{len(todo)}: {variant.family} {variant.value}".rstrip(), file=sys.stderr, flush=True)
             failure = launch.run_apart(deck, variant.overrides, variant.ranks, folder)
         rows.append(_row(variant, failure, folder))
     done = [(row, folder) for row, folder in zip(rows, folders, strict=True) if not row["failure"]]
@@ -94,7 +94,8 @@ def study(
     except ImportError:
         print(f"{out}: no picture, for matplotlib is missing", file=sys.stderr)
     else:
-        charts.draw_study(rows, out / "study.png", f"largest {_named(rows)}, mm")
+        with atomic.writing(out / "study.png"):
+            charts.draw_study(rows, out / "study.png", f"largest {_named(rows)}, mm")
     return rows
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from mpitled import atomic, store
 from mpitled.batch import launch
-from mpitled.batch.cases import Sweep
+from mpitled.batch.cases import Told
 from mpitled.deck import unit_of
 from mpitled.errors import InputError
 from mpitled.results import markup
@@ -67,7 +67,7 @@ class Table(NamedTuple):
     beside_name: str
 
 
-def collect(sweep: Sweep, beside: Path | None = None) -> Table:
+def collect(sweep: Told, beside: Path | None = None) -> Table:
     """What the cases gave, done, broken or not computed. `beside`: a CSV of the varied keys and columns of ours."""
     rows, times = [], []
     for case in sweep.cases:
@@ -89,7 +89,7 @@ def collect(sweep: Sweep, beside: Path | None = None) -> Table:
     return Table(sweep.keys, rows, times, theirs, beside.name if beside else "")
 
 
-def write(sweep: Sweep, table: Table) -> list[Path]:
+def write(sweep: Told, table: Table) -> list[Path]:
     """Write table.csv, times.csv, table.h5, table.md, table.html and the charts into the sweep's folder."""
     folder = sweep.folder
     paths = [folder / name for name in ("table.csv", "times.csv", "table.h5", "table.md", "table.html")]
@@ -98,7 +98,8 @@ def write(sweep: Sweep, table: Table) -> list[Path]:
     groups = {"table": table.rows, "times": table.times}
     store.write_columns(paths[2], {name: _columns(rows) for name, rows in groups.items()})
     atomic.write_text(paths[3], markdown(table))
-    charts = _draw(table, folder)
+    with atomic.writing(folder):
+        charts = _draw(table, folder)
     atomic.write_text(paths[4], _html(sweep, table, charts))
     programs = {launch.about(case.folder).get("program") for case in sweep.cases if case.failure == ""}
     if len(programs) > 1:
@@ -273,10 +274,10 @@ def _label(row: Row, keys: Sequence[str]) -> str:
     return " ".join(f"{row[key]:g}" if isinstance(row[key], float) else str(row[key]) for key in keys)
 
 
-def _html(sweep: Sweep, table: Table, charts: Sequence[Path]) -> str:
+def _html(sweep: Told, table: Table, charts: Sequence[Path]) -> str:
     """A page that is one file: the table, and the charts."""
     headings, lines = _rendered(table)
-    title, n = sweep.cases[0].deck.title or sweep.deck.stem, len(sweep.cases)
+    title, n = sweep.title or sweep.deck.stem, len(sweep.cases)
     alt = {
         "quantities": f"Charts of the results against {table.keys[0]}",
         "cost": "Chart of the distance from the static solution in mm against the time of the loop in s",

@@ -18,13 +18,15 @@ from typing import NoReturn
 from mpitled import atomic, lock, store
 from mpitled import deck as decks
 from mpitled.batch import launch
-from mpitled.batch.cases import Case, Sweep, is_sweep
+from mpitled.batch.cases import MANIFEST, Case, Sweep, is_sweep
 from mpitled.batch.screen import Screen, share_done
 from mpitled.errors import InputError, InterruptedRun, MpitledError, everywhere
 from mpitled.solver import checkpoint, job
 from mpitled.solver.halo import World
 
 _WATCH = 0.2  # s between looks at what is at work
+#: Folders of programs that are found anyway, and must not come before those of modules.
+_SYSTEM = ("/bin", "/usr/bin", "/usr/local/bin")
 
 
 def compute(sweep: Sweep, world: World, *, jobs: int = 1, retry: bool = False, only: int | None = None) -> None:
@@ -261,9 +263,19 @@ def _logged(path: Path) -> Iterator[None]:
 
 
 def array_job(sweep: Sweep, scheduler: str) -> Path:
-    """A script that computes each case as a task of an array job of SLURM or PBS; time and queue are the user's."""
-    sweep.write_manifest()
+    """A script that computes each case as a task of an array job of SLURM or PBS; time and queue are the user's.
+
+    InputError if the scheduler cannot be told of the sweep's folder.
+    """
     n, ranks, folder = len(sweep.cases), sweep.ranks, sweep.folder.resolve()
+    logs = _logs(folder, scheduler)
+    manifest = sweep.folder / MANIFEST
+    before = manifest.read_bytes() if manifest.exists() else b""
+    sweep.write_manifest()
+    with atomic.writing(folder):
+        if manifest.read_bytes() != before:  # another scheduler's script is of other cases or ranks
+            for path in (folder / "slurm.sh", folder / "pbs.sh"):
+                path.unlink(missing_ok=True)
     name = re.sub("[^A-Za-z0-9]", "_", folder.name)[:15].lstrip("_0123456789") or "sweep"  # as PBS takes it
     words = f"mpitled sweep {shlex.quote(str(folder))} --only"
     if scheduler == "slurm":
@@ -275,7 +287,7 @@ def array_job(sweep: Sweep, scheduler: str) -> Path:
             "#SBATCH --hint=nomultithread",
             "#SBATCH --time=01:00:00",
             "#SBATCH --signal=B:USR1@120",
-            f"#SBATCH --output={folder}/slurm-%a.log",
+            logs,
         ]
         body = [
             "launch=(srun --mpi=pmix)",
@@ -290,7 +302,7 @@ def array_job(sweep: Sweep, scheduler: str) -> Path:
         ]
     else:
         head = [f"#PBS -N {name}", "#PBS -j oe"]
-        head += [f"#PBS -l select=1:ncpus={ranks}:mpiprocs={ranks}", "#PBS -l walltime=01:00:00", f"#PBS -o {folder}"]
+        head += [f"#PBS -l select=1:ncpus={ranks}:mpiprocs={ranks}", "#PBS -l walltime=01:00:00", logs]
         head += [f"#PBS -J 1-{n}"] if n > 1 else []  # PBS refuses arrays of one
         body = [
             "# Two minutes less than the walltime, in seconds: PBS gives no notice.",
@@ -306,14 +318,39 @@ def array_job(sweep: Sweep, scheduler: str) -> Path:
         "set -euo pipefail",
         f"cd {shlex.quote(str(Path.cwd()))}",
         "# module load openmpi hdf5",
-        "[ ! -f jobs/environment.sh ] || . jobs/environment.sh",
+        *_environment(),
         "export OMP_NUM_THREADS=1",
         *body,
     ]
     path = sweep.folder / f"{scheduler}.sh"
-    path.write_text("\n".join(script) + "\n")
-    path.chmod(0o755)
+    atomic.write_text(path, "\n".join(script) + "\n")
+    with atomic.writing(path):
+        path.chmod(0o755)
     return path
+
+
+def _logs(folder: Path, scheduler: str) -> str:
+    """The line that puts the tasks' logs into a folder; InputError if there is no way to write its path in one."""
+    text = str(folder)
+    if not re.fullmatch(r"[^\n\"'\\]+" if scheduler == "slurm" else r"[^\s\"'\\:,]+", text):
+        raise InputError(
+            f"{folder}: {scheduler} takes no such path for its logs; give an --out without blanks and quotes"
+        )
+    if scheduler == "pbs":
+        return f"#PBS -o {text}"
+    path = text.replace("%", "%%") + "/slurm-%A_%a.log"  # a job of its own when it is submitted again
+    return f'#SBATCH --output="{path}"' if re.search(r"\s", text) else f"#SBATCH --output={path}"
+
+
+def _environment() -> list[str]:
+    """Lines that lead to this program: its clone's set-up if there is one, and its folder."""
+    clones = (Path.cwd(), Path(sys.prefix).parent)
+    setup = [path for clone in clones if (path := clone / "jobs" / "environment.sh").is_file()]
+    here = Path(sys.executable).parent
+    if not (here / "mpitled").exists() and (found := shutil.which("mpitled")):
+        here = Path(found).resolve().parent
+    lines = [f". {shlex.quote(str(path))}" for path in setup[:1]]
+    return lines + ([f"export PATH={shlex.quote(str(here))}:$PATH"] if str(here) not in _SYSTEM else [])
 
 
 def _count(n: int, what: str) -> str:

@@ -72,7 +72,9 @@ def predict(path: Path, counts: Sequence[int], cluster: Cluster, out: Path, seed
         _say(f"{out}: no picture, for matplotlib is missing")
     else:
         n_cells = len(hexahedra) + len(domains)
-        charts.draw_prediction(rows, f"{n_cells / 1e6:.3g} M cells", cluster.assumptions(), out / "predict.png")
+        path = out / "predict.png"
+        with atomic.writing(path):
+            charts.draw_prediction(rows, f"{n_cells / 1e6:.3g} M cells", cluster.assumptions(), path)
     return rows
 
 
