@@ -138,7 +138,7 @@ def _refuse_sweep(folder: Path) -> None:
 
 
 def _sweep(options: argparse.Namespace) -> int:
-    from mpitled.batch import cases, growth, sweep, vary
+    from mpitled.batch import cases, growth, summary, sweep, vary
     from mpitled.errors import everywhere
     from mpitled.solver.halo import World
 
@@ -151,7 +151,7 @@ def _sweep(options: argparse.Namespace) -> int:
         else:
             if not options.vary and not options.cases:
                 raise InputError("sweep: nothing is varied; give --vary KEY=A,B,... or --cases CSV")
-            values = vary.table(options.cases) if options.cases else vary.grid(options.vary)
+            values = vary.table(options.cases, summary.NAMES) if options.cases else vary.grid(options.vary)
             out = options.out or Path("out") / f"sweep_{options.deck.stem}"
             plan = cases.plan(options.deck, values, options.set, options.ranks or 1, out, options.one_growth)
         if plan.one_growth and (options.scheduler or options.only):

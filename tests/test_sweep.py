@@ -111,6 +111,8 @@ def test_tables_for_programs_and_for_people(tmp_path, groups):
     for name in ("quantities.png", "cost.png"):
         assert (out / name).stat().st_size > 10_000
     assert [record["case"] for record in open_sweep(out)] == [1, 2, 3]
+    again = mpitled(*WORDS[:6], "--cases", out / "table.csv", "--out", out, status=3)  # the same cases
+    assert again.stderr == "1 broken; --retry computes them again\n"
 
 
 def test_a_table_says_which_cases_were_warned_of(tmp_path, groups):
@@ -121,9 +123,9 @@ def test_a_table_says_which_cases_were_warned_of(tmp_path, groups):
     path.write_text(json.dumps(made | {"warnings": ["far from rest", "coarse"], "cloud_misfit_mm": 0.75}))
     table = summary.collect(sweep)
     summary.write(sweep, table)
-    words = "warning for solver.load_steps = 500: far from rest; coarse"
+    words = "warning for solver.load_steps=500: far from rest; coarse"
     printed = summary.text(table).splitlines()
-    assert [line.endswith("*") for line in printed[-4:-2]] == [False, True]
+    assert [line.split()[1] == "*" for line in printed[-4:-1]] == [False, True, False]
     assert "0.750" in printed[-3]
     assert printed[-1] == words
     assert (out / "table.md").read_text().endswith(f"\n\n- {words}\n")
@@ -132,6 +134,45 @@ def test_a_table_says_which_cases_were_warned_of(tmp_path, groups):
         assert [row["warnings"] for row in csv.DictReader(file)] == ["", "far from rest; coarse", ""]
     with h5py.File(out / "table.h5") as file:
         assert file["table/warnings"].asstr()[1] == "far from rest; coarse"
+    page = (out / "table.html").read_text()
+    assert re.search(r'<th scope="col" class="number">solver.<wbr>load_steps</th><th scope="col">warned</th>', page)
+    assert '<th scope="col" class="number">largest displacement, mm</th>' in page  # though a case has none
+    assert re.search(r'<td colspan="\d+">unstable', page)
+
+    # Of two keys, two of whose cases were warned of the same.
+    nu = "material.brain.poissons_ratio"
+    rows = [row | {nu: 0.45 + 0.01 * i, "warnings": "coarse"} for i, row in enumerate(table.rows[:2])]
+    table = table._replace(keys=[*table.keys, nu], rows=[*rows, *table.rows[2:]])
+    assert summary.text(table._replace(rows=rows, times=table.times[:2])).splitlines()[-1] == (
+        f"warning for solver.load_steps=400 {nu}=0.45, solver.load_steps=500 {nu}=0.46: coarse"
+    )
+
+
+def test_charts_show_what_differs_by_names_that_fit(tmp_path, groups, monkeypatch):
+    from matplotlib.figure import Figure
+
+    from mpitled.results import charts
+
+    def drawn(table: summary.Table) -> tuple[list[str], list[str], list[str]]:
+        figures: list[Figure] = []
+        names: list[str] = []
+        monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: figures.append(self))
+        monkeypatch.setattr(charts, "draw_cost", lambda points, _: names.extend(name for *_, name in points))
+        summary._draw(table, tmp_path)
+        (figure,) = figures
+        labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+        return [axes.get_ylabel() for axes in figure.axes], labels, names
+
+    table = summary.collect(cases.read(groups[0]))
+    rows = [row | {"cloud_misfit_mm": 0.0, "warnings": ""} for row in table.rows]
+    panels, labels, names = drawn(table._replace(rows=rows))
+    assert "largest displacement, mm" in panels
+    assert "misfit of cloud, mm" not in panels  # zero everywhere
+    assert labels == []  # one series
+    assert names == ["400", "500"]
+    nu = "material.brain.poissons_ratio"
+    rows = [row | {nu: 0.45} for row in rows]
+    assert drawn(table._replace(keys=[*table.keys, nu], rows=rows))[2][0] == "load_steps=400 poissons_ratio=0.45"
 
 
 def array_job(folder: Path, deck: Path, base: list[str], text: str, scheduler: str) -> tuple[Path, dict[str, str]]:
@@ -273,6 +314,7 @@ def test_what_cannot_be_swept_is_said_before_anything_runs(tmp_path):
         ("", "has no cases"),
         ("a,a\n1,2\n", "a key twice"),
         ("a,b\n1\n", "line 2: has 1 values for 2 keys"),
+        ("a;b\n1,5;2\n", "line 1: separate by commas, not semicolons"),
     ):
         table.write_text(text)
         with pytest.raises(InputError, match=word):
@@ -280,6 +322,14 @@ def test_what_cannot_be_swept_is_said_before_anything_runs(tmp_path):
     table.write_text("solver.load_steps,solver.tolerance\n5,\n6,0.1\n")
     values = vary.table(table)
     assert values == [{"solver.load_steps": "5"}, {"solver.load_steps": "6", "solver.tolerance": "0.1"}]
+    for text, word in (
+        ("# of today\nsolver.load_step\n\n5\n", "line 4: solver.load_step = 5: unknown key; did you mean load_steps"),
+        ("solver.load_steps\n5\n#6\n5\n", "line 4: cases 1 and 2 are the same"),
+    ):
+        table.write_text(text)
+        with pytest.raises(InputError, match=f"{table}: {word}"):
+            cases.plan(CUBE, vary.table(table), [], 1, tmp_path / "out")
+    table.write_text("solver.load_steps,solver.tolerance\n5,\n6,0.1\n")
     sweep = cases.plan(CUBE, values, [], 1, tmp_path / "out")
     for text, word in (("solver.load_steps\n", "no column solver.tolerance"), ("x\n", "no column")):
         table.write_text(text)

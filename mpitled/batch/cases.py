@@ -121,7 +121,8 @@ def plan(
     scenes = []
     for given in values:
         overrides = vary.overrides(base, given)
-        scene = decks.load_deck(deck, base, vary.words(given))
+        place = given.place if isinstance(given, vary.Line) else "varied"
+        scene = decks.load_deck(deck, base, vary.words(given), place)
         if one_growth:
             _check_growth(scene, given)
             if scene.output.frames < FRAMES:
@@ -130,9 +131,10 @@ def plan(
         files = included(scene)
         scenes.append((given, overrides, scene, decks.scene_key(scene, files), decks.model_key(scene, files)))
     numbers: dict[str, int] = {}
-    for number, (_, _, _, key, _) in enumerate(scenes, 1):
+    for number, (given, _, _, key, _) in enumerate(scenes, 1):
         if (first := numbers.setdefault(key, number)) != number:
-            raise InputError(f"{deck}: cases {first} and {number} are the same; leave one out")
+            place = given.place if isinstance(given, vary.Line) else str(deck)
+            raise InputError(f"{place}: cases {first} and {number} are the same; leave one out")
     models = [model for *_, model in scenes]
     cases, mode = [], f"{ranks} one growth" if one_growth else f"{ranks}"
     for number, (given, overrides, scene, key, model) in enumerate(scenes, 1):
