@@ -161,7 +161,7 @@ def _sweep(options: argparse.Namespace) -> int:
         if world.leads:
             print(json.dumps({"script": str(path)}) if options.json else path)
         return 0
-    sweep.compute(plan, world, jobs=options.jobs, retry=options.retry, only=options.only)
+    sweep.compute(plan, world, jobs=options.jobs, retry=options.retry, only=options.only, quiet=options.quiet)
     if options.only:
         return int(world.on_leader(lambda: _tell_case(plan, plan.cases[options.only - 1], options)))
     if plan.one_growth and world.leads:
@@ -188,7 +188,13 @@ def _tabulate(told: Told, options: argparse.Namespace, *, must: bool) -> int:
     from mpitled.batch import summary
 
     table = summary.collect(told, options.beside)
-    print(json.dumps(summary.records(table), indent=2) if options.json else summary.text(table))
+    if options.json:
+        print(json.dumps(summary.records(table), indent=2))
+    elif not options.quiet:
+        print(summary.text(table))
+    else:
+        for text in summary.warnings(table):
+            print(f"mpitled: {text}", file=sys.stderr)
     try:
         summary.write(told, table)
     except InputError as error:
@@ -196,7 +202,7 @@ def _tabulate(told: Told, options: argparse.Namespace, *, must: bool) -> int:
             raise
         _note(error)
     else:
-        if not options.json:
+        if not (options.json or options.quiet):
             print(f"written to {told.folder}")
     if broken := [case for case in told.cases if case.failure]:
         print(f"{len(broken)} broken; --retry computes them again", file=sys.stderr)
@@ -303,8 +309,11 @@ def _study(options: argparse.Namespace) -> None:
 
     beyond = options.beyond and options.beyond / 1e3
     out = options.out or Path("out") / f"study_{options.deck.stem}"
-    print(study.table(study.study(options.deck, options.reference, options.vary, options.set, out, beyond)))
-    print(f"written to {out}")
+    rows = study.study(options.deck, options.reference, options.vary, options.set, out, beyond, quiet=options.quiet)
+    if options.json:
+        print(json.dumps(study.records(rows), indent=2))
+    elif not options.quiet:
+        print(f"{study.table(rows)}\nwritten to {out}")
 
 
 def _bench(options: argparse.Namespace) -> int:
@@ -348,8 +357,10 @@ def _predict(options: argparse.Namespace) -> None:
                 raise InputError(f"--{name} {value:g}: is not a number above 0; give one")
             cluster = replace(cluster, **{name: value * unit})
     out = options.out or path.parent
-    print(predict.table(predict.predict(path, counts, cluster, out), cluster))
-    print(f"written to {out}")
+    rows = predict.predict(path, counts, cluster, out)
+    _print(rows, partial(predict.table, cluster=cluster), options)
+    if not options.json:
+        print(f"written to {out}")
 
 
 def _numbers(name: str, text: str) -> list[int]:

@@ -93,8 +93,8 @@ def collect(sweep: Told, beside: Path | None = None) -> Table:
                 ) from None
         given: Row = {"case": case.number} | {key: _number(case.values.get(key, "")) for key in sweep.keys}
         figures: Row = {column.name: _figure(found, column.key) for column in COLUMNS}
-        warnings: Row = {WARNINGS.name: "; ".join(found.get(WARNINGS.key, []))}
-        rows.append(given | figures | warnings | {"failure": "not computed" if failure is None else failure})
+        warned: Row = {WARNINGS.name: "; ".join(found.get(WARNINGS.key, []))}
+        rows.append(given | figures | warned | {"failure": "not computed" if failure is None else failure})
         times.append({"case": case.number} | {column.name: _figure(found, column.key) for column in TIMES})
     theirs = _read_beside(beside, sweep.keys, rows) if beside else {}
     return Table(sweep.keys, rows, times, theirs, beside.name if beside else "")
@@ -130,8 +130,8 @@ def markdown(table: Table) -> str:
         cells = line.cells + [line.remark] * bool(line.remark)
         cells += [""] * (len(headings) - len(cells))
         text.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
-    warnings = [f"- {words}" for words in _warnings(table)]
-    return "\n".join([*text, *([""] if warnings else []), *warnings]) + "\n"
+    warned = [f"- {words}" for words in warnings(table)]
+    return "\n".join([*text, *([""] if warned else []), *warned]) + "\n"
 
 
 def text(table: Table) -> str:
@@ -146,7 +146,7 @@ def text(table: Table) -> str:
     for line in rows:
         shown = [f"{cell:>{width}}" for cell, width in zip(line.cells, widths, strict=False)]
         made.append("  ".join([*shown, line.remark] if line.remark else shown))
-    return "\n".join([*made, *_warnings(table)])
+    return "\n".join([*made, *warnings(table)])
 
 
 def records(table: Table) -> list[dict[str, Any]]:
@@ -230,7 +230,7 @@ def _rendered(table: Table) -> tuple[list[str], list[_Line]]:
     return headings, lines
 
 
-def _warnings(table: Table) -> list[str]:
+def warnings(table: Table) -> list[str]:
     """What the marked cases were warned of, a line for all that were warned of the same."""
     warned: dict[str, list[str]] = {}
     for row in table.rows:
@@ -305,10 +305,10 @@ def _html(sweep: Told, table: Table, charts: Sequence[Path]) -> str:
         "quantities": f"Charts of the results against {table.keys[0]}",
         "cost": "Chart of the distance from the static solution in mm against the time of the loop in s",
     }
-    warnings = _warnings(table)
+    warned = warnings(table)
     rows = [line.cells + [line.remark] * bool(line.remark) for line in lines]
     parts = {
-        "Results": [markup.table(headings, rows), *([markup.note(warnings)] if warnings else [])],
+        "Results": [markup.table(headings, rows), *([markup.note(warned)] if warned else [])],
         "Charts": [markup.picture(path.read_bytes(), alt[path.stem]) for path in charts],
     }
     head = [markup.text(f"{n} cases of {sweep.deck.name}, varied: {', '.join(table.keys)}", "faint")]

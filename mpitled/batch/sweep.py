@@ -29,7 +29,9 @@ _WATCH = 0.2  # s between looks at what is at work
 _SYSTEM = ("/bin", "/usr/bin", "/usr/local/bin")
 
 
-def compute(sweep: Sweep, world: World, *, jobs: int = 1, retry: bool = False, only: int | None = None) -> None:
+def compute(
+    sweep: Sweep, world: World, *, jobs: int = 1, retry: bool = False, only: int | None = None, quiet: bool = False
+) -> None:
     """Compute what is not done yet; an error in one case does not end the others. Broken cases only with `retry`.
 
     On one rank `jobs` cases are at work at once, each on `sweep.ranks` ranks of its own. On many ranks groups of
@@ -55,12 +57,12 @@ def compute(sweep: Sweep, world: World, *, jobs: int = 1, retry: bool = False, o
         todo.sort(key=lambda case: -case.work)
         first = {case.model: case for case in todo if case.shares and not _is_built(case, sweep.ranks)}
         models = [] if only else list(first.values())
-        if world.leads and todo:
+        if world.leads and todo and not quiet:
             _begin(sweep, cases, len(todo), world.size // sweep.ranks if world.size > 1 else jobs)
         if world.size > 1:
-            _in_groups(sweep, models, todo, world, sweep.folder / f".claims-{token}")
+            _in_groups(sweep, models, todo, world, sweep.folder / f".claims-{token}", Screen(quiet))
         else:
-            _as_processes(sweep, models, todo, jobs)
+            _as_processes(sweep, models, todo, jobs, Screen(quiet))
         world.on_leader(lambda: _refuse_to_wait(todo))
 
 
@@ -113,9 +115,9 @@ def _alone(sweep: Sweep, world: World, only: int | None) -> Iterator[None]:
 # --- on a workstation ----------------------------------------------------------------------------------------------
 
 
-def _as_processes(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], jobs: int) -> None:
+def _as_processes(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], jobs: int, screen: Screen) -> None:
     """A process for each case, so many at once; first the models that several cases share."""
-    screen, working = Screen(), dict[Case, launch.Process]()
+    working = dict[Case, launch.Process]()
     alone = {case: ExitStack() for case in todo}
     ends = (signal.SIGTERM, signal.SIGUSR1)
     previous = [signal.signal(which, signal.default_int_handler) for which in ends]
@@ -189,7 +191,9 @@ def _end(sweep: Sweep, case: Case, failure: str, screen: Screen) -> None:
 # --- in groups of ranks --------------------------------------------------------------------------------------------
 
 
-def _in_groups(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], world: World, claims: Path) -> None:
+def _in_groups(
+    sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], world: World, claims: Path, screen: Screen
+) -> None:
     """Each group takes the first case in the queue that no other has taken, until there is none."""
     group = world.split(sweep.ranks)
     world.on_leader(lambda: claims.mkdir())
@@ -197,7 +201,6 @@ def _in_groups(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], world
         if group.leads and _claim(claims / case.model.name):
             _build(sweep, case)
     world.barrier()
-    screen = Screen()
     for case in todo:
         with ExitStack() as alone:
             mine = group.leads and _claim(claims / case.folder.name)
