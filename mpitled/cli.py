@@ -179,7 +179,8 @@ def _tell_case(plan: Sweep, case: Case, options: argparse.Namespace) -> int:
         (record,) = summary.records(summary.collect(replace(plan, cases=(case,))))
         print(json.dumps(record, indent=2))
     if case.failure:
-        print(f"mpitled: case {case.number}, {case.words}: {case.failure}", file=sys.stderr)
+        told = f"mpitled: case {case.number}, {case.words}: {case.failure}"
+        print(f"{told} (--retry computes it again)", file=sys.stderr)
     return 3 if case.failure else 0
 
 

@@ -272,10 +272,9 @@ def _draw(table: Table, folder: Path) -> list[Path]:
         charts.draw_quantities(families, key, label, quantities, shares, folder / "quantities.png")
         made.append(folder / "quantities.png")
     if timed := [row for row in rows if row["static_distance_mm"] != "" and row["loop_s"] != ""]:
-        names = [_label(row, table.keys) + (" (warned)" if row[WARNINGS.name] else "") for row in timed]
         points = [
-            (float(row["loop_s"]), float(row["static_distance_mm"]), name)
-            for row, name in zip(timed, names, strict=True)
+            (float(row["loop_s"]), float(row["static_distance_mm"]), name + (" (warned)" if row[WARNINGS.name] else ""))
+            for row, name in zip(timed, _names(timed, table.keys), strict=True)
         ]
         charts.draw_cost(points, folder / "cost.png")
         made.append(folder / "cost.png")
@@ -286,15 +285,12 @@ def _value(value: float | str) -> str:
     return f"{value:.10g}" if isinstance(value, float) else value
 
 
-def _label(row: Row, keys: Sequence[str]) -> str:
-    """A case in a chart: the value of its key; of several keys with the last parts of their names, if there is room."""
-    values = [_value(row[key]) for key in keys]
-    if len(keys) > 1:
-        pairs = zip(keys, values, strict=True)
-        named = " ".join(f"{key.rpartition('.')[2]}={value}" for key, value in pairs)
-        if len(named) <= _LONGEST:
-            return named
-    return " ".join(values)
+def _names(rows: Sequence[Row], keys: Sequence[str]) -> list[str]:
+    """Cases in a chart: the value of a key; of several keys with the last parts of their names, if there is room."""
+    named = [" ".join(f"{key.rpartition('.')[2]}={_value(row[key])}" for key in keys) for row in rows]
+    if len(keys) > 1 and max(map(len, named)) <= _LONGEST:
+        return named
+    return [" ".join(_value(row[key]) for key in keys) for row in rows]
 
 
 def _html(sweep: Told, table: Table, charts: Sequence[Path]) -> str:

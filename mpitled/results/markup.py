@@ -163,7 +163,7 @@ def _row(cells: Iterable[str]) -> str:
 
 def _breakable(heading: str) -> str:
     """Escaped, so that a long key of a deck may go on in another line after its dots."""
-    return re.sub(r"(?<=[a-z])\.(?=[a-z])", ".<wbr>", escape(heading))
+    return re.sub(r"(?<=[a-z])\.(?=\w)|(?<=\w)\.(?=[a-z])", ".<wbr>", escape(heading))
 
 
 def _class(kind: str) -> str:
