@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import fcntl
+import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO
 
 from mpitled import atomic
 from mpitled.errors import InputError
@@ -21,19 +23,33 @@ class Taken(InputError):
 
 @contextmanager
 def held(folder: Path, name: str, who: str = "run") -> Iterator[None]:
-    """A folder, made if need be, for this process alone. Taken if another `who` is at work there.
-
-    The file of the lock stays: to remove one that somebody waits for would let two in.
-    """
+    """A folder, made if need be, for this process alone. Taken if another `who` is at work there."""
     atomic.make_folder(folder)
     path = folder / name
-    with atomic.writing(path):
-        file = path.open("w")
-    with file:
+    while True:
+        with atomic.writing(path):
+            file = path.open("w")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
+            file.close()
             raise Taken(f"{folder}: another {who} {REMEDY}") from None
         except OSError:
-            pass  # there are none here
+            break  # there are none here
+        if _is_there(file, path):
+            break
+        file.close()  # who held it has just removed it
+    try:
         yield
+    finally:
+        with suppress(OSError):
+            path.unlink()
+        file.close()
+
+
+def _is_there(file: IO[str], path: Path) -> bool:
+    """Whether an open file still has its name."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except OSError:
+        return False
