@@ -1,4 +1,5 @@
-# Sourced by jobs/brain.sh and tests/run.sh: all that mpitled needs, made once in .venv, and the variables to run it.
+# Sourced by jobs/brain.sh and tests/run.sh, or by a user in any folder, in which it leaves him: all that mpitled needs,
+# made once in .venv, and the variables to run it. If that fails it returns 2, with a line that says why.
 #
 # MPI and HDF5 with MPI come from, in this order: what is there already (Debian's OpenMPI build of HDF5, or on a cluster
 # mpicc and HDF5_DIR of the site's modules), apt-get as root or with sudo, or without root a copy unpacked in .deps.
@@ -81,7 +82,7 @@ mpitled_use_unpacked() { # the variables that the copy in .deps needs
     export LD_LIBRARY_PATH="$library/hdf5/openmpi:$library${LD_LIBRARY_PATH:+:$LD_LIBRARY_PATH}"
     local site
     site=$("$mpitled_root/.venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
-    [ -d "$site/../../../lib" ] && export LD_LIBRARY_PATH="$LD_LIBRARY_PATH:$mpitled_root/.venv/lib"
+    [ ! -d "$site/../../../lib" ] || export LD_LIBRARY_PATH="$LD_LIBRARY_PATH:$mpitled_root/.venv/lib"
     export HDF5_INCLUDEDIR="$mpitled_root/.deps/usr/include/hdf5/openmpi" HDF5_LIBDIR="$library/hdf5/openmpi"
     export OMPI_MCA_plm_rsh_agent=/bin/true
 }
@@ -124,15 +125,27 @@ mpitled_prepare() { # MPI, HDF5, and in .venv an h5py built on them
     mpitled_has_h5py || mpitled_fail "h5py was built without MPI: remove .venv, and try again"
 }
 
-cd "$mpitled_root"
-mpitled_stamp=$(cat pyproject.toml jobs/environment.sh | cksum)
-if [ "$(cat .venv/made-from 2>/dev/null)" = "$mpitled_stamp" ] && [ -x .venv/bin/mpitled ]; then
-    mpitled_variables
-else
+mpitled_stamp=$(cat "$mpitled_root/pyproject.toml" "$mpitled_root/jobs/environment.sh" | cksum)
+mpitled_is_done() {
+    [ "$(cat "$mpitled_root/.venv/made-from" 2>/dev/null)" = "$mpitled_stamp" ] && [ -x "$mpitled_root/.venv/bin/mpitled" ]
+}
+
+mpitled_set_up() { # in the top folder
     [ ! -x .venv/bin/python ] || mpitled_variables
     mpitled_has_h5py || mpitled_prepare
     # setuptools warns of folders that an editable install makes importable.
     PYTHONWARNINGS=ignore .venv/bin/pip install -q --no-build-isolation -e '.[images,pictures,progress,tests]' ||
         mpitled_fail "the packages that pyproject.toml names could not be installed (see above)"
     echo "$mpitled_stamp" >.venv/made-from
-fi
+}
+
+mpitled_is_done || (
+    # In a shell of its own, which may fail and go where it likes; one at a time, for jobs of an array begin together.
+    set -euo pipefail
+    cd "$mpitled_root"
+    exec 9>.venv.lock
+    flock 9 2>/dev/null || true
+    mpitled_is_done || mpitled_set_up
+)
+mpitled_is_done || return 2
+mpitled_variables

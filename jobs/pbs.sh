@@ -8,6 +8,7 @@
 #PBS -l walltime=02:00:00
 #PBS -j oe
 set -euo pipefail
+[ -n "${DECK:-}" ] || { echo "usage: qsub -v DECK=FILE[,SET=\"SECTION.KEY=VALUE ...\"] jobs/pbs.sh" >&2 && exit 2; }
 cd "${PBS_O_WORKDIR:-.}"
 # module load openmpi hdf5
 . jobs/environment.sh

@@ -9,6 +9,7 @@
 #SBATCH --time=02:00:00
 #SBATCH --signal=B:USR1@120 # two minutes before the time is up the run keeps a checkpoint and ends; the same job goes on from it
 set -euo pipefail
+[ $# -gt 0 ] || { echo "usage: sbatch [--nodes N] jobs/slurm.sh DECK [--set SECTION.KEY=VALUE ...]" >&2 && exit 2; }
 cd "${SLURM_SUBMIT_DIR:-.}"
 # module load openmpi hdf5
 . jobs/environment.sh

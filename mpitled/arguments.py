@@ -24,7 +24,7 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
 
     def command(name: str, words: str, *, json: bool = False) -> argparse.ArgumentParser:
         added = of_all.add_parser(name, help=words)
-        added.set_defaults(command=commands[name], verbose=False, json=False)
+        added.set_defaults(command=commands[name], verbose=False, quiet=False, json=False)
         if json:
             added.add_argument("--json", action="store_true", help="JSON instead of a table")
         return added
@@ -37,7 +37,7 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
         action="store_true",
         help="also each phase as it begins, with its rank, and every figure at the end; of --dry, every array",
     )
-    run.add_argument("-q", "--quiet", action="store_true", help="no progress and no table")
+    _quiet(run)
     run.add_argument("--resume", action="store_true", help="go on from the last checkpoint; from the start without one")
     run.add_argument(
         "--dry", action="store_true", help="say how long it would take, and what would be done (-v: in full); no step"
@@ -66,6 +66,7 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
     )
     sweep.add_argument("--scheduler", choices=["slurm", "pbs"], help="write an array job, compute nothing")
     _beside(sweep)
+    _quiet(sweep)
 
     new = command("new", "write a deck with comments to begin with")
     new.add_argument("kind", choices=KINDS, help="geometry: a label image, mesh files, or a shape")
@@ -101,8 +102,9 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
         "--beyond", type=float, metavar="MM", help="also only places farther than this from edges of prescribed surface"
     )
 
-    study = command("study", "error against run time over varied keys; goes on where it was stopped")
+    study = command("study", "error against run time over varied keys; goes on where it was stopped", json=True)
     _deck(study, prefix="study_")
+    _quiet(study)
     vary = study.add_argument(
         "--vary",
         action="append",
@@ -133,7 +135,7 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
     bench.add_argument("--scaling", action="store_true", help="instead: ranks beside as many runs of one rank at once")
     bench.add_argument("--omissions", action="store_true", help="instead: what each thing costs that a scene can lack")
 
-    predict = command("predict", "efficiency on a cluster, from real partitions in many parts")
+    predict = command("predict", "efficiency on a cluster, from real partitions in many parts", json=True)
     _model(predict)
     predict.add_argument(
         "--parts", default="64,256,1024,4096,16384", metavar="N,...", help="numbers of ranks (%(default)s)"
@@ -166,6 +168,10 @@ def _deck(added: argparse.ArgumentParser, what: str = "the scene, a TOML file", 
     folder = f"out/{prefix}NAME OF THE DECK"
     added.add_argument("--out", type=Path, metavar="DIR", help=f"folder of the results ({folder})")
     _set(added)
+
+
+def _quiet(added: argparse.ArgumentParser) -> None:
+    added.add_argument("-q", "--quiet", action="store_true", help="no progress and no table")
 
 
 def _set(added: argparse.ArgumentParser) -> None:

@@ -18,7 +18,7 @@ from mpitled import arguments
 from mpitled.errors import InputError, InterruptedRun, MpitledError
 
 if TYPE_CHECKING:
-    from mpitled.batch.cases import Sweep
+    from mpitled.batch.cases import Case, Sweep, Told
 
 # Modules are imported by the command that needs them: `--help` must not wait for compilers and libraries.
 
@@ -119,6 +119,7 @@ def _run(options: argparse.Namespace) -> None:
         if world.leads:
             print(told)
         return
+    world.on_leader(lambda: _refuse_sweep(_output(options)))
     for which in INTERRUPTS:  # what comes after the end of the run must not make a failure of it
         signal.signal(which, signal.SIG_IGN)
     made = run(deck, _output(options), world, quiet=options.quiet, resume=options.resume)
@@ -133,8 +134,16 @@ def _run(options: argparse.Namespace) -> None:
             print(f"written to {_output(options)}; mpitled report {_output(options)} --html makes a page of it")
 
 
+def _refuse_sweep(folder: Path) -> None:
+    """InputError for the folder of a sweep, whose table a run would hide."""
+    from mpitled.batch.cases import is_sweep
+
+    if is_sweep(folder):
+        raise InputError(f"{folder}: is the folder of a sweep; give another --out")
+
+
 def _sweep(options: argparse.Namespace) -> int:
-    from mpitled.batch import cases, growth, sweep, vary
+    from mpitled.batch import cases, growth, summary, sweep, vary
     from mpitled.errors import everywhere
     from mpitled.solver.halo import World
 
@@ -147,34 +156,67 @@ def _sweep(options: argparse.Namespace) -> int:
         else:
             if not options.vary and not options.cases:
                 raise InputError("sweep: nothing is varied; give --vary KEY=A,B,... or --cases CSV")
-            values = vary.table(options.cases) if options.cases else vary.grid(options.vary)
+            values = vary.table(options.cases, summary.NAMES) if options.cases else vary.grid(options.vary)
             out = options.out or Path("out") / f"sweep_{options.deck.stem}"
             plan = cases.plan(options.deck, values, options.set, options.ranks or 1, out, options.one_growth)
         if plan.one_growth and (options.scheduler or options.only):
             raise InputError("--one-growth: is one run, and no array of jobs; leave out --scheduler and --only")
     if options.scheduler:
+        path = world.on_leader(lambda: sweep.array_job(plan, options.scheduler))
         if world.leads:
-            print(sweep.array_job(plan, options.scheduler))
+            print(json.dumps({"script": str(path)}) if options.json else path)
         return 0
-    sweep.compute(plan, world, jobs=options.jobs, retry=options.retry, only=options.only)
+    sweep.compute(plan, world, jobs=options.jobs, retry=options.retry, only=options.only, quiet=options.quiet)
+    if options.only:
+        return int(world.on_leader(lambda: _tell_case(plan, plan.cases[options.only - 1], options)))
     if plan.one_growth and world.leads:
         growth.tell(plan)
-    return _tabulate(plan, options) if world.leads and not options.only else 0
+    return _tabulate(plan, options, must=True) if world.leads else 0
 
 
-def _tabulate(plan: Sweep, options: argparse.Namespace) -> int:
-    """Write and print the table of a sweep; 3 if a case is broken."""
+def _tell_case(plan: Sweep, case: Case, options: argparse.Namespace) -> int:
+    """What became of a case by itself; 3 if it is broken."""
+    from dataclasses import replace
+
     from mpitled.batch import summary
 
-    table = summary.collect(plan, options.beside)
-    summary.write(plan, table)
+    if options.json:
+        (record,) = summary.records(summary.collect(replace(plan, cases=(case,))))
+        print(json.dumps(record, indent=2))
+    if case.failure:
+        told = f"mpitled: case {case.number}, {case.words}: {case.failure}"
+        print(f"{told} (--retry computes it again)", file=sys.stderr)
+    return 3 if case.failure else 0
+
+
+def _tabulate(told: Told, options: argparse.Namespace, *, must: bool) -> int:
+    """Print the table of a sweep, then write it; 3 if a case is broken. `must`: InputError if the disc refuses."""
+    from mpitled.batch import summary
+
+    table = summary.collect(told, options.beside)
     if options.json:
         print(json.dumps(summary.records(table), indent=2))
+    elif not options.quiet:
+        print(summary.text(table))
     else:
-        print(f"{summary.text(table)}\nwritten to {plan.folder}")
-    if broken := [case for case in plan.cases if case.failure]:
+        for text in summary.warnings(table):
+            print(f"mpitled: {text}", file=sys.stderr)
+    try:
+        summary.write(told, table)
+    except InputError as error:
+        if must:
+            raise
+        _note(error)
+    else:
+        if not (options.json or options.quiet):
+            print(f"written to {told.folder}")
+    if broken := [case for case in told.cases if case.failure]:
         print(f"{len(broken)} broken; --retry computes them again", file=sys.stderr)
     return 3 if broken else 0
+
+
+def _note(error: InputError) -> None:
+    print(f"note: {error}", file=sys.stderr)
 
 
 def _new(options: argparse.Namespace) -> None:
@@ -239,14 +281,19 @@ def _report(options: argparse.Namespace) -> int:
     from mpitled.results import report
 
     if cases.is_sweep(options.directory):
-        return _tabulate(cases.read(options.directory), options)
+        return _tabulate(cases.told(options.directory), options, must=False)
+    made = report.make(options.directory)
+    _print(made, report.table, options)
     if options.html:
         from mpitled.results import page
 
-        _print(page.write(options.directory), report.table, options)
-        print(f"written to {options.directory / page.PAGE}", file=sys.stderr)
+        report.keep(options.directory, made)
+        print(f"written to {page.write(options.directory, made)}", file=sys.stderr)
     else:
-        _print(report.write(options.directory), report.table, options)
+        try:
+            report.keep(options.directory, made)
+        except InputError as error:
+            _note(error)
     return 0
 
 
@@ -268,8 +315,11 @@ def _study(options: argparse.Namespace) -> None:
 
     beyond = options.beyond and options.beyond / 1e3
     out = options.out or Path("out") / f"study_{options.deck.stem}"
-    print(study.table(study.study(options.deck, options.reference, options.vary, options.set, out, beyond)))
-    print(f"written to {out}")
+    rows = study.study(options.deck, options.reference, options.vary, options.set, out, beyond, quiet=options.quiet)
+    if options.json:
+        print(json.dumps(study.records(rows), indent=2))
+    elif not options.quiet:
+        print(f"{study.table(rows)}\nwritten to {out}")
 
 
 def _bench(options: argparse.Namespace) -> int:
@@ -313,8 +363,10 @@ def _predict(options: argparse.Namespace) -> None:
                 raise InputError(f"--{name} {value:g}: is not a number above 0; give one")
             cluster = replace(cluster, **{name: value * unit})
     out = options.out or path.parent
-    print(predict.table(predict.predict(path, counts, cluster, out), cluster))
-    print(f"written to {out}")
+    rows = predict.predict(path, counts, cluster, out)
+    _print(rows, partial(predict.table, cluster=cluster), options)
+    if not options.json:
+        print(f"written to {out}")
 
 
 def _numbers(name: str, text: str) -> list[int]:

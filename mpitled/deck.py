@@ -355,17 +355,19 @@ def _axes(section: Fixed | Displaced) -> tuple[int, ...]:
 # --- from TOML -----------------------------------------------------------------------------------------------------
 
 
-def load_deck(path: str | Path, overrides: str | Sequence[str] = (), varied: Sequence[str] = ()) -> Deck:
+def load_deck(
+    path: str | Path, overrides: str | Sequence[str] = (), varied: Sequence[str] = (), place: str = "varied"
+) -> Deck:
     """The scene of a TOML file, changed by one or more overrides "section.key=value"; InputError if anything is wrong.
 
     The right side of an override is a TOML value; quotes around a string may be left out. Entries of [[fixed]] and
     [[displaced]] count from 0: "fixed.0.nodes=skull". Files are relative to the deck's folder, also in overrides.
-    Those of a case or variant, `varied`, come last; messages tell them apart.
+    Those of a case or variant, `varied`, come last; messages tell them apart by their `place`.
     """
     path = Path(path)
     table = _parse(path)
     overrides = [overrides] if isinstance(overrides, str) else overrides
-    given = [*(("--set", text) for text in overrides), *(("varied", text) for text in varied)]
+    given = [*(("--set", text) for text in overrides), *((place, text) for text in varied)]
     source = _Source(path, {_override(table, text, option): option for option, text in given})
     deck: Deck = _section(Deck, table, "", source, {"path": path})
     _check(deck, source)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -65,7 +66,8 @@ def write_abaqus(path: Path, directory: Path) -> list[Path]:
                     file.writelines(lines)
                 os.replace(temporary, directory / name)
             finally:
-                temporary.unlink(missing_ok=True)
+                with suppress(OSError):  # which would hide why nothing was written
+                    temporary.unlink()
             written.append(directory / name)
     except OSError as error:
         raise InputError(f"{error.filename or directory}: cannot be written ({error.strerror})") from None

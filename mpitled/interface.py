@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled import preprocess, store
-from mpitled.batch.cases import read as read_sweep
+from mpitled.batch import cases
 from mpitled.batch.summary import collect, records
 from mpitled.deck import Deck, load_deck
 from mpitled.errors import InputError
@@ -71,7 +71,7 @@ def open_result(path: str | Path) -> RunResult:
 
 def open_sweep(folder: str | Path) -> list[dict[str, Any]]:
     """A record for each case of a sweep, as pandas.DataFrame takes them. InputError if the folder holds no sweep."""
-    return records(collect(read_sweep(Path(folder))))
+    return records(collect(cases.told(Path(folder))))
 
 
 class Frames:

@@ -137,5 +137,6 @@ def _meshes(folder: Path) -> list[Path]:
         scene = deck.load_deck(sample)
         store.write_model(model, preprocess.build(scene), "", deck.canonical(scene))
         *meshes, _ = export.write_abaqus(model, Path(temporary) / "export")
-        folder.mkdir(parents=True, exist_ok=True)
-        return [Path(shutil.copy(mesh, folder)) for mesh in meshes]
+        with atomic.writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            return [Path(shutil.copy(mesh, folder)) for mesh in meshes]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import functools
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -101,3 +103,44 @@ def test_a_job_ends_in_order_before_its_time_is_up(tmp_path, script):
     with open_result(tmp_path / "out" / "scene") as result:
         assert not result.complete
     assert (tmp_path / "out" / "scene" / "checkpoint.h5").exists()  # the same job would go on from it
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_job_without_a_deck_says_how_to_give_one(tmp_path, script):
+    variables = {name: value for name, value in ENVIRONMENT.items() if name != "DECK"}
+    done = subprocess.run(["bash", ROOT / "jobs" / script], env=variables, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert re.fullmatch(r"usage: .*DECK.*\n", done.stderr)
+
+
+def sourced(clone: Path, words: str, path: str) -> subprocess.CompletedProcess[str]:
+    """A shell in another folder that sources a clone's set-up, then goes on."""
+    (clone.parent / "elsewhere").mkdir(exist_ok=True)
+    return subprocess.run(
+        ["bash", "-c", f"{words}. {clone}/jobs/environment.sh; echo $? $PWD; command -v mpitled"],
+        env={"PATH": path}, cwd=clone.parent / "elsewhere", capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+
+
+def test_the_set_up_leaves_a_shell_open_and_where_it_was(tmp_path):
+    """Done before, and where nothing can be set up, for there is no Python."""
+    clone, tools = tmp_path / "clone", tmp_path / "tools"
+    (clone / "jobs").mkdir(parents=True)
+    (clone / "pyproject.toml").touch()
+    shutil.copy(ROOT / "jobs" / "environment.sh", clone / "jobs")
+    tools.mkdir()
+    for tool in ("cat", "cksum", "dirname", "bash"):
+        (tools / tool).symlink_to(str(shutil.which(tool)))
+    done = sourced(clone, "", str(tools))
+    assert done.stdout == f"2 {tmp_path}/elsewhere\n"
+    assert done.stderr == "mpitled set-up: no Python 3.10 or newer: install one, and try again\n"
+    done = sourced(clone, "set -euo pipefail; ", str(tools))  # as scripts do
+    assert (done.returncode, done.stdout) == (2, "")
+
+    made = clone / ".venv" / "bin" / "mpitled"
+    made.parent.mkdir(parents=True)
+    made.touch(0o755)
+    stamp = "cat pyproject.toml jobs/environment.sh | cksum > .venv/made-from"
+    subprocess.run(["bash", "-c", stamp], cwd=clone, check=True)
+    for words in ("", "set -euo pipefail; "):
+        assert sourced(clone, words, str(tools)).stdout == f"0 {tmp_path}/elsewhere\n{made}\n"

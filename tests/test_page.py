@@ -67,7 +67,7 @@ def stopped(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", lambda self, *to, **how: (drawn.append(self), save(self, *to, **how)))
         patch.setattr(sys, "executable", shutil.which("false"))  # PyVista's process, which then fails
-        page.write(folder / "out")
+        page.write(folder / "out", report.write(folder / "out"))
         found = {"pushed through the interface": 4008.5, "compression of the cloud": 95.4}  # it has no tumour
         charts.draw_balance(4155.3, found, io.BytesIO())
     return folder / "out", drawn

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 
 import numpy as np
 import pytest
@@ -46,10 +47,11 @@ def test_every_number_of_parts_is_cut_as_metis_cuts_it(tmp_path):
     deck = tmp_path / "scene.toml"
     deck.write_text(SCENE)
     mpitled("build", deck, "--out", tmp_path)
-    told = mpitled("predict", tmp_path, "--parts", "4,16,3,8", "--rate", "10", "--out", tmp_path / "p")
+    told = mpitled("predict", tmp_path, "--parts", "4,16,3,8", "--rate", "10", "--out", tmp_path / "p", "--json")
     with (tmp_path / "p" / "predict.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert tuple(rows[0]) == COLUMNS
+    assert [row["parts"] for row in json.loads(told.stdout)] == [3, 4, 8, 16]
     assert [int(row["parts"]) for row in rows] == [3, 4, 8, 16]
     assert told.stderr.count("METIS") == 2  # 8 and 4 lie on the way to 16
     assert (tmp_path / "p" / "predict.png").stat().st_size > 10_000

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib.metadata
 import json
 import os
@@ -335,6 +336,23 @@ def test_report_goes_on_without_matplotlib(grown, monkeypatch):
     made = report.write(grown[0])
     assert "pip install" in made["pictures"]
     assert made["pictures"] in report.table(made)
+
+
+def test_a_folder_that_cannot_be_written_has_its_table(grown, monkeypatch):
+    """A page is refused, for it is what was asked for."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    for name in ("replace", "unlink"):  # nor can the temporary file be removed
+        monkeypatch.setattr(os, name, refuse)
+    done = mpitled("report", grown[0])
+    assert "largest displacement" in done.stdout
+    said = f"{grown[0] / 'report.json'}: cannot be written (Read-only file system)"
+    assert done.stderr == f"note: {said}\n"
+    done = mpitled("report", grown[0], "--html", status=2)
+    assert "largest displacement" in done.stdout
+    assert done.stderr == f"mpitled: {said}\n"
 
 
 def test_cuts_are_exact():

@@ -32,6 +32,7 @@ def test_a_study_goes_on_where_it_stopped_and_tells_errors_and_failures(tmp_path
     ]  # fmt: skip
     first = mpitled(*arguments)
     assert first.stderr.count("/6: ") == 6
+    assert "1/6: as it is\n" in first.stderr
     table = rows(out)
     assert [(row["family"], row["value"], row["ranks"]) for row in table] == [
         ("as it is", "", "1"),
@@ -57,9 +58,14 @@ def test_a_study_goes_on_where_it_stopped_and_tells_errors_and_failures(tmp_path
 
     removed = next(out.glob("solver.tolerance-0.1-*"))
     shutil.rmtree(removed)
-    again = mpitled(*arguments)
-    assert again.stderr.count("/6: ") == 1
+    again = mpitled(*arguments, "--json")
+    assert "1/6: " not in again.stderr
+    assert again.stderr.count("/6: solver.tolerance 0.1\n") == 1
     assert removed.exists()
+    told = json.loads(again.stdout)
+    assert [row["max_error_mm"] is None for row in told] == [row["max_error_mm"] == "" for row in table]
+    quiet = mpitled(*arguments, "-q")
+    assert (quiet.stdout, quiet.stderr) == ("", "")
 
 
 def test_names_in_the_picture_do_not_overlap(tmp_path):

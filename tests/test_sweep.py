@@ -20,8 +20,8 @@ import pytest
 from conftest import ENVIRONMENT, ROOT, complaint, mpitled
 from scenes import TUMOUR, block, pulled
 
-from mpitled import open_sweep
-from mpitled.batch import cases, screen, summary, vary
+from mpitled import lock, open_sweep
+from mpitled.batch import cases, launch, screen, summary, vary
 from mpitled.batch import sweep as array
 from mpitled.errors import InputError
 from mpitled.store import checkpoint_contents
@@ -111,6 +111,8 @@ def test_tables_for_programs_and_for_people(tmp_path, groups):
     for name in ("quantities.png", "cost.png"):
         assert (out / name).stat().st_size > 10_000
     assert [record["case"] for record in open_sweep(out)] == [1, 2, 3]
+    again = mpitled(*WORDS[:6], "--cases", out / "table.csv", "--out", out, "-q", "--retry", status=3)  # the same cases
+    assert (again.stdout, again.stderr) == ("", "1 broken; --retry computes them again\n")
 
 
 def test_a_table_says_which_cases_were_warned_of(tmp_path, groups):
@@ -121,9 +123,9 @@ def test_a_table_says_which_cases_were_warned_of(tmp_path, groups):
     path.write_text(json.dumps(made | {"warnings": ["far from rest", "coarse"], "cloud_misfit_mm": 0.75}))
     table = summary.collect(sweep)
     summary.write(sweep, table)
-    words = "warning for solver.load_steps = 500: far from rest; coarse"
+    words = "warning for solver.load_steps=500: far from rest; coarse"
     printed = summary.text(table).splitlines()
-    assert [line.endswith("*") for line in printed[-4:-2]] == [False, True]
+    assert [line.split()[1] == "*" for line in printed[-4:-1]] == [False, True, False]
     assert "0.750" in printed[-3]
     assert printed[-1] == words
     assert (out / "table.md").read_text().endswith(f"\n\n- {words}\n")
@@ -132,6 +134,45 @@ def test_a_table_says_which_cases_were_warned_of(tmp_path, groups):
         assert [row["warnings"] for row in csv.DictReader(file)] == ["", "far from rest; coarse", ""]
     with h5py.File(out / "table.h5") as file:
         assert file["table/warnings"].asstr()[1] == "far from rest; coarse"
+    page = (out / "table.html").read_text()
+    assert re.search(r'<th scope="col" class="number">solver.<wbr>load_steps</th><th scope="col">warned</th>', page)
+    assert '<th scope="col" class="number">largest displacement, mm</th>' in page  # though a case has none
+    assert re.search(r'<td colspan="\d+">unstable', page)
+
+    # Of two keys, two of whose cases were warned of the same.
+    nu = "material.brain.poissons_ratio"
+    rows = [row | {nu: 0.45 + 0.01 * i, "warnings": "coarse"} for i, row in enumerate(table.rows[:2])]
+    table = table._replace(keys=[*table.keys, nu], rows=[*rows, *table.rows[2:]])
+    assert summary.text(table._replace(rows=rows, times=table.times[:2])).splitlines()[-1] == (
+        f"warning for solver.load_steps=400 {nu}=0.45, solver.load_steps=500 {nu}=0.46: coarse"
+    )
+
+
+def test_charts_show_what_differs_by_names_that_fit(tmp_path, groups, monkeypatch):
+    from matplotlib.figure import Figure
+
+    from mpitled.results import charts
+
+    def drawn(table: summary.Table) -> tuple[list[str], list[str], list[str]]:
+        figures: list[Figure] = []
+        names: list[str] = []
+        monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: figures.append(self))
+        monkeypatch.setattr(charts, "draw_cost", lambda points, _: names.extend(name for *_, name in points))
+        summary._draw(table, tmp_path)
+        (figure,) = figures
+        labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+        return [axes.get_ylabel() for axes in figure.axes], labels, names
+
+    table = summary.collect(cases.read(groups[0]))
+    rows = [row | {"cloud_misfit_mm": 0.0, "warnings": ""} for row in table.rows]
+    panels, labels, names = drawn(table._replace(rows=rows))
+    assert "largest displacement, mm" in panels
+    assert "misfit of cloud, mm" not in panels  # zero everywhere
+    assert labels == []  # one series
+    assert names == ["400", "500"]
+    nu = "material.brain.poissons_ratio"
+    rows = [row | {nu: 0.45} for row in rows]
+    assert drawn(table._replace(keys=[*table.keys, nu], rows=rows))[2][0] == "load_steps=400 poissons_ratio=0.45"
 
 
 def array_job(folder: Path, deck: Path, base: list[str], text: str, scheduler: str) -> tuple[Path, dict[str, str]]:
@@ -160,12 +201,52 @@ def test_an_array_job_computes_each_task_alone(tmp_path, monkeypatch):
         assert "1-3\n" in script.read_text()
         assert "# 3 cases, each on 1 rank;" in script.read_text()
         assert ("srun --mpi=pmix" in script.read_text()) == (scheduler == "slurm")
+        assert f"export PATH={Path(sys.executable).parent}:$PATH" in script.read_text()
         task = {number: "2" if scheduler == "slurm" else "3"}
         subprocess.run([script], env=variables | task, check=True, timeout=120, stderr=subprocess.DEVNULL)
         (tmp_path / "sourced").unlink()
     out = tmp_path / "out"
     assert [case.failure for case in cases.read(out).cases] == [None, "", ""]
     assert mpitled("report", out).stdout.count("not computed") == 1
+
+
+def test_an_array_job_fits_its_sweep(tmp_path, monkeypatch):
+    """Number of ranks, logs beside a path's blanks, no script of another plan, and a program that is found."""
+    deck, out, spaced = tmp_path / "scene.toml", tmp_path / "out", tmp_path / "my 50% files"
+    deck.write_text(GROWTH)
+    words = ["sweep", deck, "--vary", "tumour.volume=150,300"]
+    mpitled(*words, "--out", out, "--scheduler", "pbs")
+    mpitled(*words, "--out", out, "--scheduler", "slurm")
+    assert (out / "pbs.sh").exists()
+    mpitled(*words, "--out", out, "--scheduler", "slurm", "--ranks", 2)
+    assert not (out / "pbs.sh").exists()
+    line = complaint(mpitled("sweep", out, "--only", 1, n=4, status=2))
+    assert "--only 1: has 2 ranks a case, and 4 started; start as many" in line
+    monkeypatch.setenv("OMPI_COMM_WORLD_SIZE", "1")
+    assert "and 1 started" in complaint(mpitled("sweep", out, "--only", 1, status=2))
+    monkeypatch.delenv("OMPI_COMM_WORLD_SIZE")
+
+    script = Path(mpitled(*words, "--out", spaced, "--scheduler", "slurm").stdout.strip())
+    log = f"{tmp_path}/my 50%% files/slurm-%A_%a.log"
+    assert f'#SBATCH --output="{log}"' in script.read_text()
+    assert "pbs takes no such path" in complaint(mpitled(*words, "--out", spaced, "--scheduler", "pbs", status=2))
+    # Submitted from any folder, by a shell that knows of no program.
+    monkeypatch.chdir(tmp_path)
+    plan = cases.plan(deck, vary.grid(["tumour.volume=150"]), [], 1, spaced)
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / "none"))
+    lines = [line for line in array.array_job(plan, "slurm").read_text().splitlines() if not line.startswith("#")]
+    begin = "\n".join(lines[: lines.index("launch=(srun --mpi=pmix)")])
+    shell = ["env", "-i", "PATH=/usr/bin:/bin", "bash", "-c", f"{begin}\ncommand -v mpitled"]
+    found = subprocess.run(shell, capture_output=True, text=True, check=True).stdout
+    assert found.strip() == str(Path(sys.executable).with_name("mpitled"))
+
+
+def test_a_reason_is_no_rule_of_a_banner(tmp_path):
+    """mpirun frames what it has to say."""
+    words = ["sh", "-c", "echo there are not enough slots; echo; echo ------; exit 1"]
+    process = launch.Process(words, tmp_path)
+    process.ended()
+    assert process.failure == "there are not enough slots"
 
 
 @pytest.mark.parametrize("scheduler", ["slurm", "pbs"])
@@ -233,6 +314,7 @@ def test_what_cannot_be_swept_is_said_before_anything_runs(tmp_path):
         ("", "has no cases"),
         ("a,a\n1,2\n", "a key twice"),
         ("a,b\n1\n", "line 2: has 1 values for 2 keys"),
+        ("a;b\n1,5;2\n", "line 1: separate by commas, not semicolons"),
     ):
         table.write_text(text)
         with pytest.raises(InputError, match=word):
@@ -240,6 +322,14 @@ def test_what_cannot_be_swept_is_said_before_anything_runs(tmp_path):
     table.write_text("solver.load_steps,solver.tolerance\n5,\n6,0.1\n")
     values = vary.table(table)
     assert values == [{"solver.load_steps": "5"}, {"solver.load_steps": "6", "solver.tolerance": "0.1"}]
+    for text, word in (
+        ("# of today\nsolver.load_step\n\n5\n", "line 4: solver.load_step = 5: unknown key; did you mean load_steps"),
+        ("solver.load_steps\n5\n#6\n5\n", "line 4: cases 1 and 2 are the same"),
+    ):
+        table.write_text(text)
+        with pytest.raises(InputError, match=f"{table}: {word}"):
+            cases.plan(CUBE, vary.table(table), [], 1, tmp_path / "out")
+    table.write_text("solver.load_steps,solver.tolerance\n5,\n6,0.1\n")
     sweep = cases.plan(CUBE, values, [], 1, tmp_path / "out")
     for text, word in (("solver.load_steps\n", "no column solver.tolerance"), ("x\n", "no column")):
         table.write_text(text)
@@ -271,6 +361,76 @@ def test_two_sweeps_do_not_work_in_one_folder(tmp_path):
     assert "another sweep is at work" in done.stderr
 
 
+def test_two_processes_do_not_compute_one_case(tmp_path):
+    """Be it a task that is submitted again, a sweep, a run or a study: what is at work keeps its folder."""
+    pytest.importorskip("fcntl")
+    out, study = tmp_path / "out", tmp_path / "study"
+    keys = ["block.elements=[2,2,2]", "solver.method=dynamic-relaxation"]
+    plan = cases.plan(CUBE, vary.grid(["solver.load_steps=400,500"]), keys, 1, out)
+    plan.write_manifest()
+    busy, free = plan.cases
+    for name in (lock.RUN, lock.TASK):
+        busy.folder.mkdir(exist_ok=True)
+        (busy.folder / "precious").touch()
+        with lock.held(busy.folder, name):
+            for words in (["--only", "1"], []):
+                line = complaint(mpitled("sweep", out, *words, status=2))
+                assert f"{busy.folder}: another run is at work there" in line
+                assert (busy.folder / "precious").exists()
+                assert busy.failure is None
+            complaint(mpitled("sweep", out, n=2, status=2))
+        assert free.failure == ""
+        shutil.rmtree(free.folder)
+    with lock.held(busy.folder, lock.RUN):
+        for n in (1, 2):
+            line = complaint(mpitled("run", CUBE, "--out", busy.folder, n=n, status=2))
+            assert "another run is at work there; wait for its end, or give another --out" in line
+    words = ["study", CUBE, "--out", study, *(word for key in keys for word in ("--set", key))]
+    mpitled(*words)
+    folder = next(study.glob("as*"))
+    (folder / "done.json").unlink()
+    with lock.held(folder, lock.RUN):
+        assert "another run is at work" in complaint(mpitled(*words, status=2))
+    assert (folder / "result.vtkhdf").exists()
+
+    command = [str(Path(sys.executable).with_name("mpitled")), "sweep", str(out), "--only", "1"]
+    twice = [subprocess.Popen(command, env=ENVIRONMENT, cwd=ROOT, stderr=subprocess.DEVNULL) for _ in range(2)]
+    assert sorted(process.wait(60) for process in twice) in ([0, 2], [0, 0])  # or the second finds it done
+    assert busy.failure == ""
+    assert json.loads((busy.folder / "report.json").read_text())["load_share"] == 1
+
+
+def test_a_task_says_how_its_case_ended(tmp_path):
+    out = tmp_path / "out"
+    mpitled(*WORDS, "--out", out, "--scheduler", "slurm")
+    line = complaint(mpitled("sweep", out, "--only", 3, status=3))
+    assert "case 3, solver.load_steps=1: unstable" in line
+    done = mpitled("sweep", out, "--only", 3, "--json", status=3)  # not computed again
+    assert "unstable" in json.loads(done.stdout)["failure"]
+    assert json.loads(mpitled("sweep", out, "--only", 1, "--json").stdout)["max_displacement_mm"] > 0
+    done = mpitled(*WORDS, "--out", out, "--scheduler", "pbs", "--json")
+    assert json.loads(done.stdout) == {"script": str(out / "pbs.sh")}
+
+
+def test_runs_and_sweeps_do_not_hide_each_other(tmp_path):
+    sweep, run = tmp_path / "sweep", tmp_path / "run"
+    cases.plan(CUBE, vary.grid(["solver.load_steps=400"]), [], 1, sweep).write_manifest()
+    run.mkdir()
+    (run / "model.h5").touch()
+    assert f"{sweep}: is the folder of a sweep" in complaint(mpitled("run", CUBE, "--out", sweep, status=2))
+    for words in ([], ["--scheduler", "slurm"]):
+        line = complaint(mpitled(*WORDS, "--out", run, *words, status=2))
+        assert f"{run}: is the folder of a run" in line
+
+
+@pytest.mark.parametrize("words", [[], ["--scheduler", "slurm"], ["--only", "1"], ["study"]])
+def test_a_folder_that_cannot_be_made_is_said_in_a_line(tmp_path, words):
+    (tmp_path / "file").touch()
+    out = tmp_path / "file" / "out"
+    command = ["study", *WORDS[1:]] if words == ["study"] else [*WORDS, *words]
+    assert f"{out}: cannot be made" in complaint(mpitled(*command, "--out", out, status=2))
+
+
 def test_another_sweep_does_not_take_the_place_of_a_table(tmp_path):
     """The same goes on and takes more values in; a study alike."""
     deck, out = tmp_path / "scene.toml", tmp_path / "out"
@@ -293,8 +453,14 @@ def test_another_sweep_does_not_take_the_place_of_a_table(tmp_path):
         deck.write_text(text.replace("3000", "4000"))
         line = complaint(mpitled(*words, "--vary", f"{nu}=0.3,0.4,0.45", status=2))
         assert "of the deck before it or a file that it reads was changed" in line
-        if command == "sweep":
-            assert "was changed since" in complaint(mpitled("report", out / "sweep", status=2))
+        if command == "sweep":  # which can still be read
+            assert "was changed since" in complaint(mpitled("sweep", out / "sweep", status=2))
+            for change in (lambda: None, deck.unlink):
+                change()
+                done = mpitled("report", out / "sweep")
+                assert f"note: {out / 'sweep'}: {deck}, or a file that it reads, is not what was swept" in done.stderr
+                assert (out / command / table).read_bytes() == kept
+                assert [row[nu] for row in open_sweep(out / "sweep")] == [0.45, 0.4, 0.3]
         deck.write_text(text)
         assert (out / command / table).read_bytes() == kept
         (out / command / f"{command}.json").unlink()

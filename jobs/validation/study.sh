@@ -2,7 +2,8 @@
 # Error against run time of a tumour of 523.6 mm3 in the ellipsoid: what the defaults of the cloud and of support domains rest on.
 # Some three minutes; goes on where it was stopped. Writes out/study_tumour/study.csv and study.png, kept in jobs/studies/.
 set -euo pipefail
-. "$(dirname "$0")/../environment.sh"
+cd "$(dirname "$0")/../.."
+. jobs/environment.sh
 mpitled study jobs/validation/tumour.toml --reference tests/data/C_tum.npz \
     --vary cloud.growth=0.15,0.3 --vary cloud.points_per_spacing=1.0,1.4 --vary support.nodes=8,12,16,24 \
     --vary support.basis=10 --vary support.weight=equal --vary support.max_fe_nodes=7 --vary support.min_domains=6 \

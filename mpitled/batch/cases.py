@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from mpitled import deck as decks
 from mpitled.batch import launch, manifest, vary
@@ -22,16 +24,12 @@ FRAMES = 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Case:
-    """One run of a sweep."""
+class Entry:
+    """One case of a sweep, as its table has it."""
 
     number: int  # from 1
     values: vary.Values  # of the varied keys
-    overrides: tuple[str, ...]
-    deck: Deck
     folder: Path
-    model: Path  # folder for the model, if several cases have the same one
-    shares: bool  # whether they do
 
     @property
     def words(self) -> str:
@@ -42,6 +40,16 @@ class Case:
     def failure(self) -> str | None:
         """None if it did not end yet, "" if it is done, or why it is broken."""
         return launch.outcome(self.folder)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Case(Entry):
+    """One run of a sweep."""
+
+    overrides: tuple[str, ...]
+    deck: Deck
+    model: Path  # folder for the model, if several cases have the same one
+    shares: bool  # whether they do
 
     @property
     def work(self) -> float:
@@ -63,31 +71,39 @@ class Case:
 
 
 @dataclass(frozen=True, slots=True)
-class Sweep:
-    """All cases of a deck in a folder."""
+class Told:
+    """All cases of a deck in a folder, as their table has them."""
 
     deck: Path
-    base: tuple[str, ...]  # overrides for all
-    ranks: int  # of each case
+    title: str
     folder: Path
-    cases: tuple[Case, ...]
-    one_growth: bool = False  # whether the largest tumour alone is run, and the others are on its way
-
-    @property
-    def runs(self) -> tuple[Case, ...]:
-        """The cases that are computed by themselves."""
-        return (max(self.cases, key=_volume),) if self.one_growth else self.cases
+    cases: Sequence[Entry]
 
     @property
     def keys(self) -> list[str]:
         """The varied keys."""
         return list(dict.fromkeys(key for case in self.cases for key in case.values))
 
+
+@dataclass(frozen=True, slots=True)
+class Sweep(Told):
+    """All cases of a deck in a folder, to be computed."""
+
+    cases: Sequence[Case]
+    base: tuple[str, ...]  # overrides for all
+    ranks: int  # of each case
+    one_growth: bool = False  # whether the largest tumour alone is run, and the others are on its way
+
+    @property
+    def runs(self) -> Sequence[Case]:
+        """The cases that are computed by themselves."""
+        return (max(self.cases, key=_volume),) if self.one_growth else self.cases
+
     def write_manifest(self) -> None:
         """What `read` takes: a sweep goes on by its folder alone, from anywhere. InputError as `manifest.claim`."""
         cases = [{"number": c.number, "folder": c.folder.name, "values": c.values} for c in self.cases]
-        told = {"deck": str(self.deck.resolve()), "overrides": self.base, "ranks": self.ranks, "cases": cases}
-        manifest.claim(self.folder / MANIFEST, told | {"one_growth": self.one_growth})
+        told = {"deck": str(self.deck.resolve()), "title": self.title, "overrides": self.base, "ranks": self.ranks}
+        manifest.claim(self.folder / MANIFEST, told | {"one_growth": self.one_growth, "cases": cases})
 
 
 def plan(
@@ -105,7 +121,8 @@ def plan(
     scenes = []
     for given in values:
         overrides = vary.overrides(base, given)
-        scene = decks.load_deck(deck, base, vary.words(given))
+        place = given.place if isinstance(given, vary.Line) else "varied"
+        scene = decks.load_deck(deck, base, vary.words(given), place)
         if one_growth:
             _check_growth(scene, given)
             if scene.output.frames < FRAMES:
@@ -114,9 +131,10 @@ def plan(
         files = included(scene)
         scenes.append((given, overrides, scene, decks.scene_key(scene, files), decks.model_key(scene, files)))
     numbers: dict[str, int] = {}
-    for number, (_, _, _, key, _) in enumerate(scenes, 1):
+    for number, (given, _, _, key, _) in enumerate(scenes, 1):
         if (first := numbers.setdefault(key, number)) != number:
-            raise InputError(f"{deck}: cases {first} and {number} are the same; leave one out")
+            place = given.place if isinstance(given, vary.Line) else str(deck)
+            raise InputError(f"{place}: cases {first} and {number} are the same; leave one out")
     models = [model for *_, model in scenes]
     cases, mode = [], f"{ranks} one growth" if one_growth else f"{ranks}"
     for number, (given, overrides, scene, key, model) in enumerate(scenes, 1):
@@ -124,11 +142,11 @@ def plan(
         name = hashlib.sha256(model.encode()).hexdigest()[:16]
         cases.append(
             Case(
-                number, given, overrides, scene, folder / vary.folder(words, f"{mode} {key}"),
-                folder / "models" / name, models.count(model) > 1,
+                number, given, folder / vary.folder(words, f"{mode} {key}"), overrides, scene, folder / "models" / name,
+                models.count(model) > 1,
             )
         )  # fmt: skip
-    return Sweep(deck, tuple(base), ranks, folder, tuple(cases), one_growth)
+    return Sweep(deck, cases[0].deck.title, folder, tuple(cases), tuple(base), ranks, one_growth)
 
 
 def _check_growth(deck: Deck, given: vary.Values) -> None:
@@ -151,20 +169,48 @@ def is_sweep(folder: Path) -> bool:
     return (folder / MANIFEST).is_file()
 
 
-def read(folder: Path) -> Sweep:
-    """The sweep that was begun in a folder."""
+class _Manifest(NamedTuple):
+    """What `Sweep.write_manifest` wrote."""
+
+    deck: Path
+    title: str
+    base: list[str]
+    ranks: int
+    one_growth: bool
+    values: list[vary.Values]
+    names: list[str]  # of the folders
+
+
+def _read_manifest(folder: Path) -> _Manifest:
     path = folder / MANIFEST
     try:
         told = json.loads(path.read_text(encoding="utf-8"))
         values = [{str(key): str(value) for key, value in case["values"].items()} for case in told["cases"]]
         deck, base, ranks = Path(told["deck"]), [str(text) for text in told["overrides"]], told["ranks"]
-        one_growth, names = told["one_growth"], [case["folder"] for case in told["cases"]]
-        if type(ranks) is not int or ranks < 1 or type(one_growth) is not bool:
-            raise ValueError(f"{ranks} ranks")
+        one_growth, names = told["one_growth"], [Path(case["folder"]).name for case in told["cases"]]
+        if type(ranks) is not int or ranks < 1 or type(one_growth) is not bool or not names or {"", ".."} & {*names}:
+            raise ValueError(f"{ranks} ranks, folders {names}")
+        return _Manifest(deck, str(told.get("title", "")), base, ranks, one_growth, values, names)
     except FileNotFoundError:
         raise InputError(f"{folder}: holds no sweep; give a deck, or the folder that 'mpitled sweep' wrote") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise InputError(f"{path}: cannot be read; give the deck again with --vary or --cases") from None
+
+
+def told(folder: Path) -> Told:
+    """What was swept in a folder, though the deck be another by now, or gone; a note says so."""
+    deck, title, _, _, _, values, names = _read_manifest(folder)
+    try:
+        return read(folder)
+    except (InputError, OSError):
+        print(f"note: {folder}: {deck}, or a file that it reads, is not what was swept any more", file=sys.stderr)
+    pairs = enumerate(zip(values, names, strict=True), 1)
+    return Told(deck, title, folder, [Entry(number, given, folder / name) for number, (given, name) in pairs])
+
+
+def read(folder: Path) -> Sweep:
+    """The sweep that was begun in a folder, to go on."""
+    deck, _, base, ranks, one_growth, values, names = _read_manifest(folder)
     sweep = plan(deck, values, base, ranks, folder, one_growth)
     if [case.folder.name for case in sweep.cases] != names:
         raise InputError(

@@ -37,7 +37,7 @@ def tell(sweep: Sweep) -> None:
         outcome = None
         failure = run.failure or str(error)
     for case in todo:
-        case.folder.mkdir(parents=True, exist_ok=True)
+        atomic.make_folder(case.folder)
         if outcome is not None:
             failure = _tell(case, run, outcome)
         launch.record(case.folder, failure, program=decks.program())

@@ -11,9 +11,10 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
-from mpitled import atomic
+from mpitled import atomic, lock
 
 #: Says in a run's folder that it ended, and how.
 DONE = "done.json"
@@ -42,12 +43,11 @@ class Process:
     """A command at work in a folder of its own, where the log is what it says. It ends when this process is killed."""
 
     def __init__(self, words: Sequence[str], folder: Path, longest: int | None = None) -> None:
-        """Computing for longer (s) than that, it is killed."""
+        """In a folder that is there. Computing for longer (s) than that, it is killed."""
         self.folder = folder
-        folder.mkdir(parents=True, exist_ok=True)
         # mpirun takes its ranks along when it is asked to end, and only then.
         last = signal.SIGTERM if words[0] == "mpirun" else signal.SIGKILL
-        with (folder / LOG).open("wb") as log:
+        with atomic.writing(folder / LOG), (folder / LOG).open("wb") as log:
             self._process = subprocess.Popen(
                 words,
                 stdin=subprocess.DEVNULL,
@@ -75,7 +75,7 @@ class Process:
         status = self._process.returncode
         if status == 0:
             return ""
-        lines = said(self.folder)
+        lines = [line for line in said(self.folder) if any(map(str.isalpha, line))]  # mpirun draws rules too
         named = [line.removeprefix("mpitled: ") for line in lines if line.startswith("mpitled: ")]
         if status < 0 and not named:
             killed = f"killed by {signal.Signals(-status).name}"
@@ -105,14 +105,23 @@ def said(folder: Path) -> list[str]:
 
 
 def prepare(folder: Path, model: Path | None = None) -> None:
-    """An empty folder for a run, with a model that is there already: it is not built if it is the deck's."""
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True, exist_ok=True)
-    if model and model.exists():
-        try:
-            os.link(model, folder / model.name)
-        except OSError:  # not every file system has links
-            shutil.copyfile(model, folder / model.name)
+    """An empty folder for a run, with a model that is there already: it is not built if it is the deck's.
+
+    lock.Taken if a run is at work there; only locks are left.
+    """
+    with lock.held(folder, lock.RUN):
+        for path in folder.iterdir():
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path, ignore_errors=True)
+            elif path.name not in (lock.RUN, lock.TASK):
+                with suppress(OSError):
+                    path.unlink()
+        if model and model.exists():
+            try:
+                os.link(model, folder / model.name)
+            except OSError:  # not every file system has links
+                with atomic.writing(folder / model.name):
+                    shutil.copyfile(model, folder / model.name)
 
 
 def record(folder: Path, failure: str, **more: str) -> None:
@@ -123,13 +132,14 @@ def record(folder: Path, failure: str, **more: str) -> None:
 def run_apart(deck: Path, overrides: Sequence[str], ranks: int, folder: Path, longest: int | None = None) -> str:
     """Compute a deck in its folder, emptied before; the reason of its failure, "" if it is done.
 
-    If it computes for longer (s) than that it is killed.
+    If it computes for longer (s) than that it is killed. lock.Taken if another is at work there.
     """
-    prepare(folder)
-    process = Process(command("run", deck, overrides, ranks, folder), folder, longest)
-    process.ended()
-    record(folder, process.failure, status=str(process.status))
-    return process.failure
+    with lock.held(folder, lock.TASK):
+        prepare(folder)
+        process = Process(command("run", deck, overrides, ranks, folder), folder, longest)
+        process.ended()
+        record(folder, process.failure, status=str(process.status))
+        return process.failure
 
 
 def about(folder: Path) -> dict[str, str]:

@@ -10,20 +10,23 @@ from typing import Any
 from mpitled import atomic
 from mpitled.batch import launch
 from mpitled.errors import InputError
+from mpitled.solver.job import MODEL
 
 
 def claim(path: Path, manifest: Mapping[str, Any]) -> None:
     """Write a manifest, whose "cases" each have a "folder" beside it and "values" by key.
 
     InputError if another one is there, and a case of it that is done is none of these: the same cases go on, and more
-    may be added to them.
+    may be added to them. InputError as well if the folder is a run's, which its table would hide.
     """
+    if (path.parent / MODEL).exists():
+        raise InputError(f"{path.parent}: is the folder of a run; give another --out")
     if other := _other(path, manifest):
         raise InputError(
             f"{path.parent}: holds the table of another {path.stem}, {other}; give another --out, or remove {path} to "
             "replace it"
         )
-    path.parent.mkdir(parents=True, exist_ok=True)
+    atomic.make_folder(path.parent)
     atomic.write_text(path, json.dumps(manifest, indent=2) + "\n")
 
 

@@ -17,14 +17,17 @@ def share_done(log: Sequence[str]) -> float:
 
 
 class Screen:
-    """Lines on stderr; in colours, and with bars that stay below them, on a terminal only."""
+    """Lines on stderr, or none if it is quiet; in colours, and with bars that stay below them, on a terminal only."""
 
-    def __init__(self) -> None:
-        self._live = sys.stderr.isatty()
+    def __init__(self, quiet: bool = False) -> None:
+        self._quiet = quiet
+        self._live = sys.stderr.isatty() and not quiet
         self._bars = 0
 
     def tell(self, text: str, good: bool = True) -> None:
         """A line that stays."""
+        if self._quiet:
+            return
         self._clear()
         if self._live:
             text = f"{_GREEN if good else _RED}{text}{_PLAIN}"

@@ -53,7 +53,13 @@ def variants(vary: Sequence[str], base: Sequence[str]) -> Iterator[Variant]:
 
 
 def study(
-    deck: Path, reference: Path | None, vary: Sequence[str], base: Sequence[str], out: Path, beyond: float | None
+    deck: Path,
+    reference: Path | None,
+    vary: Sequence[str],
+    base: Sequence[str],
+    out: Path,
+    beyond: float | None,
+    quiet: bool = False,
 ) -> list[dict[str, Any]]:
     """Run what has not been run yet, one after the other, and tell what all of them gave: study.csv and study.png.
 
@@ -71,7 +77,8 @@ def study(
     rows = []
     for i, (variant, folder) in enumerate(zip(todo, folders, strict=True), 1):
         if (failure := launch.outcome(folder)) is None:
-            print(f"{i}/{len(todo)}: {variant.family} {variant.value}", file=sys.stderr, flush=True)
+            if not quiet:
+                print(f"{i}/{len(todo)}: {variant.family} {variant.value}".rstrip(), file=sys.stderr, flush=True)
             failure = launch.run_apart(deck, variant.overrides, variant.ranks, folder)
         rows.append(_row(variant, failure, folder))
     done = [(row, folder) for row, folder in zip(rows, folders, strict=True) if not row["failure"]]
@@ -94,7 +101,8 @@ def study(
     except ImportError:
         print(f"{out}: no picture, for matplotlib is missing", file=sys.stderr)
     else:
-        charts.draw_study(rows, out / "study.png", f"largest {_named(rows)}, mm")
+        with atomic.writing(out / "study.png"):
+            charts.draw_study(rows, out / "study.png", f"largest {_named(rows)}, mm")
     return rows
 
 
@@ -133,6 +141,12 @@ def _is_best(row: dict[str, Any], rows: list[dict[str, Any]]) -> bool:
         and (other["max_error_mm"], other["loop_s"]) != (row["max_error_mm"], row["loop_s"])
         for other in others
     )
+
+
+def records(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows for JSON: nothing where there is no number."""
+    texts = ("value", "warnings", "failure")
+    return [{name: None if v == "" and name not in texts else v for name, v in row.items()} for row in rows]
 
 
 def table(rows: list[dict[str, Any]]) -> str:

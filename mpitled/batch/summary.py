@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from mpitled import atomic, store
 from mpitled.batch import launch
-from mpitled.batch.cases import Sweep
+from mpitled.batch.cases import Told
 from mpitled.deck import unit_of
 from mpitled.errors import InputError
 from mpitled.results import markup
@@ -51,10 +51,21 @@ TIMES = (
 )
 #: People see a mark, and the words below the table.
 WARNINGS = _Column("warnings", "warnings", "warned", "{:.0}*")
-#: Numbers of the mesh are for the files, not for people.
-_RENDERED = (*COLUMNS[:-3], TIMES[-1], WARNINGS)
+#: Numbers of the mesh are for the files, not for people, who see the mark first.
+_RENDERED = (WARNINGS, *COLUMNS[:-3], TIMES[-1])
+#: A name of a case in a chart is no longer.
+_LONGEST = 40
 #: Columns that are text, though it be empty.
 _TEXTS = ("failure", WARNINGS.name)
+#: All columns of table.csv and times.csv but the case and its keys.
+NAMES = (*(column.name for column in (*COLUMNS, *TIMES, WARNINGS)), "failure")
+
+
+class _Line(NamedTuple):
+    """A line of the table for people."""
+
+    cells: list[str]
+    remark: str = ""  # instead of the other cells, why there are no figures
 
 
 class Table(NamedTuple):
@@ -67,7 +78,7 @@ class Table(NamedTuple):
     beside_name: str
 
 
-def collect(sweep: Sweep, beside: Path | None = None) -> Table:
+def collect(sweep: Told, beside: Path | None = None) -> Table:
     """What the cases gave, done, broken or not computed. `beside`: a CSV of the varied keys and columns of ours."""
     rows, times = [], []
     for case in sweep.cases:
@@ -82,14 +93,14 @@ def collect(sweep: Sweep, beside: Path | None = None) -> Table:
                 ) from None
         given: Row = {"case": case.number} | {key: _number(case.values.get(key, "")) for key in sweep.keys}
         figures: Row = {column.name: _figure(found, column.key) for column in COLUMNS}
-        warnings: Row = {WARNINGS.name: "; ".join(found.get(WARNINGS.key, []))}
-        rows.append(given | figures | warnings | {"failure": "not computed" if failure is None else failure})
+        warned: Row = {WARNINGS.name: "; ".join(found.get(WARNINGS.key, []))}
+        rows.append(given | figures | warned | {"failure": "not computed" if failure is None else failure})
         times.append({"case": case.number} | {column.name: _figure(found, column.key) for column in TIMES})
     theirs = _read_beside(beside, sweep.keys, rows) if beside else {}
     return Table(sweep.keys, rows, times, theirs, beside.name if beside else "")
 
 
-def write(sweep: Sweep, table: Table) -> list[Path]:
+def write(sweep: Told, table: Table) -> list[Path]:
     """Write table.csv, times.csv, table.h5, table.md, table.html and the charts into the sweep's folder."""
     folder = sweep.folder
     paths = [folder / name for name in ("table.csv", "times.csv", "table.h5", "table.md", "table.html")]
@@ -98,7 +109,8 @@ def write(sweep: Sweep, table: Table) -> list[Path]:
     groups = {"table": table.rows, "times": table.times}
     store.write_columns(paths[2], {name: _columns(rows) for name, rows in groups.items()})
     atomic.write_text(paths[3], markdown(table))
-    charts = _draw(table, folder)
+    with atomic.writing(folder):
+        charts = _draw(table, folder)
     atomic.write_text(paths[4], _html(sweep, table, charts))
     programs = {launch.about(case.folder).get("program") for case in sweep.cases if case.failure == ""}
     if len(programs) > 1:
@@ -114,9 +126,12 @@ def markdown(table: Table) -> str:
     """The table for people, in Markdown: under each case's row the one of others, if they have it."""
     headings, lines = _rendered(table)
     text = [f"| {' | '.join(headings)} |", "|" + "---|" * len(headings)]
-    text += [f"| {' | '.join(cell.replace('|', '/') for cell in line)} |" for line in lines]
-    warnings = [f"- {words}" for words in _warnings(table)]
-    return "\n".join([*text, *([""] if warnings else []), *warnings]) + "\n"
+    for line in lines:
+        cells = line.cells + [line.remark] * bool(line.remark)
+        cells += [""] * (len(headings) - len(cells))
+        text.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
+    warned = [f"- {words}" for words in warnings(table)]
+    return "\n".join([*text, *([""] if warned else []), *warned]) + "\n"
 
 
 def text(table: Table) -> str:
@@ -125,13 +140,13 @@ def text(table: Table) -> str:
     cells = [[*heading.split(", ")] for heading in headings]
     depth = max(map(len, cells))
     heads = [[(words + [""] * depth)[i] for words in cells] for i in range(depth)]
-    figures = [line for line in lines if not _is_remark(line, table)]
-    widths = [max(len(line[i]) for line in (*heads, *figures)) for i in range(len(headings))]
+    rows = [*(_Line(head) for head in heads), *lines]
+    widths = [max(len(line.cells[i]) for line in rows if i < len(line.cells)) for i in range(len(headings))]
     made = []
-    for line in (*heads, *lines):
-        shown = line if not _is_remark(line, table) else [cell for cell in line if cell]
-        made.append("  ".join(f"{cell:>{width}}" for cell, width in zip(shown, widths, strict=False)))
-    return "\n".join([*made, *_warnings(table)])
+    for line in rows:
+        shown = [f"{cell:>{width}}" for cell, width in zip(line.cells, widths, strict=False)]
+        made.append("  ".join([*shown, line.remark] if line.remark else shown))
+    return "\n".join([*made, *warnings(table)])
 
 
 def records(table: Table) -> list[dict[str, Any]]:
@@ -196,7 +211,7 @@ def _columns(rows: Sequence[Row]) -> dict[str, list[float | str]]:
 # --- what people see -----------------------------------------------------------------------------------------------
 
 
-def _rendered(table: Table) -> tuple[list[str], list[list[str]]]:
+def _rendered(table: Table) -> tuple[list[str], list[_Line]]:
     """Headings and lines of cells; of columns that no case has, none."""
     columns = [c for c in _RENDERED if any((row | time)[c.name] != "" for row, time in _pairs(table))]
     headings = [f"{key}, {unit}" if (unit := unit_of(key)) else key for key in table.keys]
@@ -204,26 +219,24 @@ def _rendered(table: Table) -> tuple[list[str], list[list[str]]]:
     headings += [] if columns else ["figures"]  # none: there is room for why
     lines = []
     for row, time in _pairs(table):
-        values = [f"{row[key]:.10g}" if isinstance(row[key], float) else str(row[key]) for key in table.keys]
+        values = [_value(row[key]) for key in table.keys]
         who = ["here"] if table.beside else []
         if row["failure"]:
-            lines.append([*values, *([""] if who else []), str(row["failure"]), *[""] * (len(columns) - 1)])
+            lines.append(_Line([*values, *who], str(row["failure"])))
         else:
-            lines.append([*values, *who, *_cells(row | time, columns)])
+            lines.append(_Line([*values, *who, *_cells(row | time, columns)]))
         if any(theirs := _cells(table.beside.get(int(row["case"]), {}), columns)):
-            lines.append([*[""] * len(values), table.beside_name, *theirs])
+            lines.append(_Line([*[""] * len(values), table.beside_name, *theirs]))
     return headings, lines
 
 
-def _is_remark(line: list[str], table: Table) -> bool:
-    """Whether it says why there are no figures."""
-    return any(row["failure"] and row["failure"] in line for row in table.rows)
-
-
-def _warnings(table: Table) -> list[str]:
-    """What the marked cases were warned of, a line each."""
-    marked = [row for row in table.rows if row[WARNINGS.name]]
-    return [f"warning for {', '.join(table.keys)} = {_label(row, table.keys)}: {row[WARNINGS.name]}" for row in marked]
+def warnings(table: Table) -> list[str]:
+    """What the marked cases were warned of, a line for all that were warned of the same."""
+    warned: dict[str, list[str]] = {}
+    for row in table.rows:
+        if words := str(row[WARNINGS.name]):
+            warned.setdefault(words, []).append(" ".join(f"{key}={_value(row[key])}" for key in table.keys))
+    return [f"warning for {', '.join(marked)}: {words}" for words, marked in warned.items()]
 
 
 def _pairs(table: Table) -> Iterator[tuple[Row, Row]]:
@@ -244,7 +257,8 @@ def _draw(table: Table, folder: Path) -> list[Path]:
     rows = [row | time for row, time in _pairs(table) if not row["failure"]]
     made = []
     numeric = [key for key in table.keys if len({row[key] for row in rows if not isinstance(row[key], str)}) > 1]
-    if numeric:
+    drawn = [column for column in COLUMNS[:-3] if any(row[column.name] not in ("", 0) for row in rows)]
+    if numeric and drawn:
         key = numeric[0]
         others = [other for other in table.keys if other != key]
         families: dict[str, list[Row]] = {}
@@ -253,37 +267,44 @@ def _draw(table: Table, folder: Path) -> list[Path]:
                 families.setdefault(" ".join(f"{other}={row[other]}" for other in others), []).append(row)
         if table.beside:
             families[table.beside_name] = list(table.beside.values())
-        drawn = [column for column in COLUMNS[:-3] if any(row[column.name] != "" for row in rows)]
         quantities, shares = {c.name: c.heading for c in drawn}, {c.name for c in drawn if "%" in c.form}
         label = f"{key}, {unit}" if (unit := unit_of(key)) else key
         charts.draw_quantities(families, key, label, quantities, shares, folder / "quantities.png")
         made.append(folder / "quantities.png")
     if timed := [row for row in rows if row["static_distance_mm"] != "" and row["loop_s"] != ""]:
-        names = [_label(row, table.keys) + (" (warned)" if row[WARNINGS.name] else "") for row in timed]
         points = [
-            (float(row["loop_s"]), float(row["static_distance_mm"]), name)
-            for row, name in zip(timed, names, strict=True)
+            (float(row["loop_s"]), float(row["static_distance_mm"]), name + (" (warned)" if row[WARNINGS.name] else ""))
+            for row, name in zip(timed, _names(timed, table.keys), strict=True)
         ]
         charts.draw_cost(points, folder / "cost.png")
         made.append(folder / "cost.png")
     return made
 
 
-def _label(row: Row, keys: Sequence[str]) -> str:
-    return " ".join(f"{row[key]:g}" if isinstance(row[key], float) else str(row[key]) for key in keys)
+def _value(value: float | str) -> str:
+    return f"{value:.10g}" if isinstance(value, float) else value
 
 
-def _html(sweep: Sweep, table: Table, charts: Sequence[Path]) -> str:
+def _names(rows: Sequence[Row], keys: Sequence[str]) -> list[str]:
+    """Cases in a chart: the value of a key; of several keys with the last parts of their names, if there is room."""
+    named = [" ".join(f"{key.rpartition('.')[2]}={_value(row[key])}" for key in keys) for row in rows]
+    if len(keys) > 1 and max(map(len, named)) <= _LONGEST:
+        return named
+    return [" ".join(_value(row[key]) for key in keys) for row in rows]
+
+
+def _html(sweep: Told, table: Table, charts: Sequence[Path]) -> str:
     """A page that is one file: the table, and the charts."""
     headings, lines = _rendered(table)
-    title, n = sweep.cases[0].deck.title or sweep.deck.stem, len(sweep.cases)
+    title, n = sweep.title or sweep.deck.stem, len(sweep.cases)
     alt = {
         "quantities": f"Charts of the results against {table.keys[0]}",
         "cost": "Chart of the distance from the static solution in mm against the time of the loop in s",
     }
-    warnings = _warnings(table)
+    warned = warnings(table)
+    rows = [line.cells + [line.remark] * bool(line.remark) for line in lines]
     parts = {
-        "Results": [markup.table(headings, lines), *([markup.note(warnings)] if warnings else [])],
+        "Results": [markup.table(headings, rows), *([markup.note(warned)] if warned else [])],
         "Charts": [markup.picture(path.read_bytes(), alt[path.stem]) for path in charts],
     }
     head = [markup.text(f"{n} cases of {sweep.deck.name}, varied: {', '.join(table.keys)}", "faint")]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
 import secrets
@@ -12,32 +11,42 @@ import signal
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import NoReturn
 
+from mpitled import atomic, lock, store
 from mpitled import deck as decks
-from mpitled import store
 from mpitled.batch import launch
-from mpitled.batch.cases import Case, Sweep, is_sweep
+from mpitled.batch.cases import MANIFEST, Case, Sweep, is_sweep
 from mpitled.batch.screen import Screen, share_done
 from mpitled.errors import InputError, InterruptedRun, MpitledError, everywhere
 from mpitled.solver import checkpoint, job
 from mpitled.solver.halo import World
 
 _WATCH = 0.2  # s between looks at what is at work
+#: Folders of programs that are found anyway, and must not come before those of modules.
+_SYSTEM = ("/bin", "/usr/bin", "/usr/local/bin")
 
 
-def compute(sweep: Sweep, world: World, *, jobs: int = 1, retry: bool = False, only: int | None = None) -> None:
+def compute(
+    sweep: Sweep, world: World, *, jobs: int = 1, retry: bool = False, only: int | None = None, quiet: bool = False
+) -> None:
     """Compute what is not done yet; an error in one case does not end the others. Broken cases only with `retry`.
 
     On one rank `jobs` cases are at work at once, each on `sweep.ranks` ranks of its own. On many ranks groups of
     `sweep.ranks` take the cases. `only` is the number of the one case to compute, as array jobs do.
-    InputError alike on all ranks if the numbers do not fit each other; InterruptedRun if it is ended from outside.
+    InputError alike on all ranks if the numbers do not fit each other, or if a case is left to another process that is
+    at work on it; InterruptedRun if it is ended from outside.
     """
     with everywhere():
         if world.size > 1 and world.size % sweep.ranks:
             raise InputError(f"--ranks {sweep.ranks}: {world.size} ranks are no whole groups of it; start a multiple")
+        if only is not None and world.started and world.size != sweep.ranks:
+            raise InputError(
+                f"--only {only}: has {_count(sweep.ranks, 'rank')} a case, and {world.size} started; start as many, or "
+                "write the array job anew with --scheduler"
+            )
         if only is not None and not 0 < only <= len(sweep.cases):
             raise InputError(f"--only {only}: there are {len(sweep.cases)} cases; count them from 1")
     cases = [case for case in sweep.runs if only is None or case.number == only]
@@ -48,12 +57,19 @@ def compute(sweep: Sweep, world: World, *, jobs: int = 1, retry: bool = False, o
         todo.sort(key=lambda case: -case.work)
         first = {case.model: case for case in todo if case.shares and not _is_built(case, sweep.ranks)}
         models = [] if only else list(first.values())
-        if world.leads and todo:
+        if world.leads and todo and not quiet:
             _begin(sweep, cases, len(todo), world.size // sweep.ranks if world.size > 1 else jobs)
         if world.size > 1:
-            _in_groups(sweep, models, todo, world, sweep.folder / f".claims-{token}")
+            _in_groups(sweep, models, todo, world, sweep.folder / f".claims-{token}", Screen(quiet))
         else:
-            _as_processes(sweep, models, todo, jobs)
+            _as_processes(sweep, models, todo, jobs, Screen(quiet))
+        world.on_leader(lambda: _refuse_to_wait(todo))
+
+
+def _refuse_to_wait(todo: Sequence[Case]) -> None:
+    """InputError if a case was left to another process and is not done yet."""
+    if left := [case for case in todo if case.failure is None]:
+        raise InputError(f"{left[0].folder}: another run is at work there; give the command again when it has ended")
 
 
 def _begin(sweep: Sweep, cases: Sequence[Case], n_open: int, at_once: int) -> None:
@@ -68,7 +84,9 @@ def _to_do(cases: Sequence[Case], retry: bool) -> list[Case]:
     """Cases that have not ended, or (retry) are broken: these are open again from now on."""
     todo = [case for case in cases if case.failure is None or (retry and case.failure)]
     for case in todo:
-        (case.folder / launch.DONE).unlink(missing_ok=True)
+        if case.failure:
+            with atomic.writing(case.folder / launch.DONE):
+                (case.folder / launch.DONE).unlink()
     return todo
 
 
@@ -80,37 +98,27 @@ def _is_built(case: Case, ranks: int) -> bool:
 @contextmanager
 def _alone(sweep: Sweep, world: World, only: int | None) -> Iterator[None]:
     """The folder for this sweep alone, if its file system has locks; tasks of an array job are at work together."""
-    held = []
+    with ExitStack() as alone:
 
-    def lock() -> None:
-        if only is not None and is_sweep(sweep.folder):
-            return  # other tasks read the manifest
-        sweep.folder.mkdir(parents=True, exist_ok=True)
-        held.append((sweep.folder / ".lock").open("w"))
-        try:
-            fcntl.flock(held[0], fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"{sweep.folder}: another sweep is at work there; wait for its end") from None
-        except OSError:
-            pass
-        sweep.write_manifest()
-        for stale in sweep.folder.glob(".claims-*"):
-            shutil.rmtree(stale, ignore_errors=True)
+        def begin() -> None:
+            if only is not None and is_sweep(sweep.folder):
+                return  # other tasks read the manifest
+            alone.enter_context(lock.held(sweep.folder, lock.RUN, "sweep"))
+            sweep.write_manifest()
+            for stale in sweep.folder.glob(".claims-*"):
+                shutil.rmtree(stale, ignore_errors=True)
 
-    try:
-        world.on_leader(lock)
+        world.on_leader(begin)
         yield
-    finally:
-        for file in held:
-            file.close()
 
 
 # --- on a workstation ----------------------------------------------------------------------------------------------
 
 
-def _as_processes(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], jobs: int) -> None:
+def _as_processes(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], jobs: int, screen: Screen) -> None:
     """A process for each case, so many at once; first the models that several cases share."""
-    screen, working = Screen(), dict[Case, launch.Process]()
+    working = dict[Case, launch.Process]()
+    alone = {case: ExitStack() for case in todo}
     ends = (signal.SIGTERM, signal.SIGUSR1)
     previous = [signal.signal(which, signal.default_int_handler) for which in ends]
     try:
@@ -119,14 +127,22 @@ def _as_processes(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], jo
             while waiting or working:
                 while waiting and len(working) < jobs:
                     case = waiting.pop(0)
-                    working[case] = _start(sweep, case, verb)
                     if verb == "build":
+                        launch.prepare(case.model)
+                        working[case] = _start(sweep, case, verb, case.model)
                         screen.tell(f"model of case {case.number} and others")
-                next(iter(working.values())).ended(_WATCH)
+                    elif (resume := _prepare(case, alone[case])) is not None:
+                        working[case] = _start(sweep, case, verb, case.folder, resume)
+                    else:
+                        alone[case].close()
+                for process in list(working.values())[:1]:
+                    process.ended(_WATCH)
                 for case in [case for case, process in working.items() if process.ended(0)]:
                     process = working.pop(case)
-                    if verb == "run":  # what a model lacks is said by the cases that cannot build it either
+                    # What a model lacks is said by the cases that cannot build it either.
+                    if verb == "run" and not process.failure.endswith(lock.REMEDY):
                         _end(sweep, case, process.failure, screen)
+                    alone[case].close()
                 shares = {case.words: share_done(launch.said(process.folder)) for case, process in working.items()}
                 screen.show(shares, len(waiting))
     except KeyboardInterrupt:
@@ -135,28 +151,33 @@ def _as_processes(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], jo
     finally:
         for process in working.values():
             process.stop()
+        for held in alone.values():
+            held.close()
         for which, handler in zip(ends, previous, strict=True):
             signal.signal(which, handler)
 
 
-def _start(sweep: Sweep, case: Case, verb: str) -> launch.Process:
-    if verb == "build":
-        launch.prepare(case.model)
-        folder, resume = case.model, False
-    else:
-        folder, resume = case.folder, _prepare(case)
+def _start(sweep: Sweep, case: Case, verb: str, folder: Path, resume: bool = False) -> launch.Process:
     return launch.Process(launch.command(verb, sweep.deck, case.overrides, sweep.ranks, folder, resume), folder)
 
 
-def _prepare(case: Case) -> bool:
-    """Make a case's folder ready; whether it goes on from the checkpoint that an interrupted run left in it."""
-    if case.failure is None:
+def _prepare(case: Case, alone: ExitStack) -> bool | None:
+    """Make a case's folder ready, and its own until `alone` is closed; whether it goes on from a checkpoint in it.
+
+    None if the case is another process's, which is at work on it or has ended by now.
+    """
+    try:
+        alone.enter_context(lock.held(case.folder, lock.TASK))
+        if case.failure is not None:
+            return None
         try:
             if checkpoint.find(case.folder, case.deck, decks.model_key(case.deck, job.included(case.deck))):
                 return True
         except InputError:  # of another program or model, or damaged: begun anew
             pass
-    launch.prepare(case.folder, case.model / job.MODEL if case.shares else None)
+        launch.prepare(case.folder, case.model / job.MODEL if case.shares else None)
+    except lock.Taken:
+        return None
     return False
 
 
@@ -170,7 +191,9 @@ def _end(sweep: Sweep, case: Case, failure: str, screen: Screen) -> None:
 # --- in groups of ranks --------------------------------------------------------------------------------------------
 
 
-def _in_groups(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], world: World, claims: Path) -> None:
+def _in_groups(
+    sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], world: World, claims: Path, screen: Screen
+) -> None:
     """Each group takes the first case in the queue that no other has taken, until there is none."""
     group = world.split(sweep.ranks)
     world.on_leader(lambda: claims.mkdir())
@@ -178,10 +201,12 @@ def _in_groups(sweep: Sweep, models: Sequence[Case], todo: Sequence[Case], world
         if group.leads and _claim(claims / case.model.name):
             _build(sweep, case)
     world.barrier()
-    screen = Screen()
     for case in todo:
-        if group.broadcast(group.leads and _claim(claims / case.folder.name)):
-            _run(sweep, case, group, screen, world)
+        with ExitStack() as alone:
+            mine = group.leads and _claim(claims / case.folder.name)
+            resume = group.broadcast(_prepare(case, alone) if mine else None)
+            if resume is not None:
+                _run(sweep, case, group, screen, world, resume)
     world.barrier()
     world.on_leader(lambda: shutil.rmtree(claims, ignore_errors=True))
 
@@ -204,15 +229,16 @@ def _build(sweep: Sweep, case: Case) -> None:
         pass
 
 
-def _run(sweep: Sweep, case: Case, group: World, screen: Screen, world: World) -> None:
+def _run(sweep: Sweep, case: Case, group: World, screen: Screen, world: World, resume: bool) -> None:
     """Compute a case on a group's ranks; its error ends the case alone if all of the group know of it."""
-    resume = bool(group.broadcast(group.leads and _prepare(case)))
     failure = ""
     with _logged(case.folder / launch.LOG if group.leads else Path(os.devnull)):
         try:
             job.run(case.deck, case.folder, group, resume=resume)
         except InterruptedRun as error:
             _abandon(world, error)
+        except lock.Taken:
+            return
         except Exception as error:
             if not isinstance(error, MpitledError):
                 traceback.print_exc()
@@ -240,9 +266,19 @@ def _logged(path: Path) -> Iterator[None]:
 
 
 def array_job(sweep: Sweep, scheduler: str) -> Path:
-    """A script that computes each case as a task of an array job of SLURM or PBS; time and queue are the user's."""
-    sweep.write_manifest()
+    """A script that computes each case as a task of an array job of SLURM or PBS; time and queue are the user's.
+
+    InputError if the scheduler cannot be told of the sweep's folder.
+    """
     n, ranks, folder = len(sweep.cases), sweep.ranks, sweep.folder.resolve()
+    logs = _logs(folder, scheduler)
+    manifest = sweep.folder / MANIFEST
+    before = manifest.read_bytes() if manifest.exists() else b""
+    sweep.write_manifest()
+    with atomic.writing(folder):
+        if manifest.read_bytes() != before:  # another scheduler's script is of other cases or ranks
+            for path in (folder / "slurm.sh", folder / "pbs.sh"):
+                path.unlink(missing_ok=True)
     name = re.sub("[^A-Za-z0-9]", "_", folder.name)[:15].lstrip("_0123456789") or "sweep"  # as PBS takes it
     words = f"mpitled sweep {shlex.quote(str(folder))} --only"
     if scheduler == "slurm":
@@ -254,7 +290,7 @@ def array_job(sweep: Sweep, scheduler: str) -> Path:
             "#SBATCH --hint=nomultithread",
             "#SBATCH --time=01:00:00",
             "#SBATCH --signal=B:USR1@120",
-            f"#SBATCH --output={folder}/slurm-%a.log",
+            logs,
         ]
         body = [
             "launch=(srun --mpi=pmix)",
@@ -269,7 +305,7 @@ def array_job(sweep: Sweep, scheduler: str) -> Path:
         ]
     else:
         head = [f"#PBS -N {name}", "#PBS -j oe"]
-        head += [f"#PBS -l select=1:ncpus={ranks}:mpiprocs={ranks}", "#PBS -l walltime=01:00:00", f"#PBS -o {folder}"]
+        head += [f"#PBS -l select=1:ncpus={ranks}:mpiprocs={ranks}", "#PBS -l walltime=01:00:00", logs]
         head += [f"#PBS -J 1-{n}"] if n > 1 else []  # PBS refuses arrays of one
         body = [
             "# Two minutes less than the walltime, in seconds: PBS gives no notice.",
@@ -285,14 +321,39 @@ def array_job(sweep: Sweep, scheduler: str) -> Path:
         "set -euo pipefail",
         f"cd {shlex.quote(str(Path.cwd()))}",
         "# module load openmpi hdf5",
-        "[ ! -f jobs/environment.sh ] || . jobs/environment.sh",
+        *_environment(),
         "export OMP_NUM_THREADS=1",
         *body,
     ]
     path = sweep.folder / f"{scheduler}.sh"
-    path.write_text("\n".join(script) + "\n")
-    path.chmod(0o755)
+    atomic.write_text(path, "\n".join(script) + "\n")
+    with atomic.writing(path):
+        path.chmod(0o755)
     return path
+
+
+def _logs(folder: Path, scheduler: str) -> str:
+    """The line that puts the tasks' logs into a folder; InputError if there is no way to write its path in one."""
+    text = str(folder)
+    if not re.fullmatch(r"[^\n\"'\\]+" if scheduler == "slurm" else r"[^\s\"'\\:,]+", text):
+        raise InputError(
+            f"{folder}: {scheduler} takes no such path for its logs; give an --out without blanks and quotes"
+        )
+    if scheduler == "pbs":
+        return f"#PBS -o {text}"
+    path = text.replace("%", "%%") + "/slurm-%A_%a.log"  # a job of its own when it is submitted again
+    return f'#SBATCH --output="{path}"' if re.search(r"\s", text) else f"#SBATCH --output={path}"
+
+
+def _environment() -> list[str]:
+    """Lines that lead to this program: its clone's set-up if there is one, and its folder."""
+    clones = (Path.cwd(), Path(sys.prefix).parent)
+    setup = [path for clone in clones if (path := clone / "jobs" / "environment.sh").is_file()]
+    here = Path(sys.executable).parent
+    if not (here / "mpitled").exists() and (found := shutil.which("mpitled")):
+        here = Path(found).resolve().parent
+    lines = [f". {shlex.quote(str(path))}" for path in setup[:1]]
+    return lines + ([f"export PATH={shlex.quote(str(here))}:$PATH"] if str(here) not in _SYSTEM else [])
 
 
 def _count(n: int, what: str) -> str:

@@ -5,13 +5,21 @@ from __future__ import annotations
 import csv
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from itertools import product
 from pathlib import Path
 
 from mpitled.errors import InputError
 
 Values = dict[str, str]  # by key, as they are written after "="
+
+
+class Line(Values):
+    """The values of a line of a table."""
+
+    def __init__(self, place: str, values: Values) -> None:
+        super().__init__(values)
+        self.place = place  # for messages
 
 
 def family(text: str) -> list[Values]:
@@ -42,23 +50,36 @@ def grid(vary: Sequence[str]) -> list[Values]:
     return [{key: value for some in chosen for key, value in some.items()} for chosen in product(*families)]
 
 
-def table(path: Path) -> list[Values]:
-    """The cases of a CSV file: keys in its first line, then the values of a case in each; an empty one leaves it."""
+def table(path: Path, results: Container[str] = ()) -> list[Line]:
+    """The cases of a CSV file: keys in its first line, then the values of a case in each; an empty one leaves it.
+
+    Lines that begin with # are not read, nor columns of `results` or of the number of the case: a sweep's own table
+    is good as well.
+    """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file)
             lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader if any(row)]
+        lines = [(number, row) for number, row in lines if not row[0].startswith("#")]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read as CSV ({error}); give keys, and below them values") from None
+    if lines and len(lines[0][1]) == 1 and ";" in lines[0][1][0]:
+        raise InputError(f"{path}: line {lines[0][0]}: separate by commas, not semicolons, and decimals by points")
     if len(lines) < 2:
         raise InputError(f"{path}: has no cases; give keys in the first line, and a line of values for each case")
-    (_, keys), *rows = lines
+    (first, keys), *rows = lines
     if len(set(keys)) < len(keys) or not all(keys):
-        raise InputError(f"{path}: line 1: has a key twice or an empty one; name each column by its key")
+        raise InputError(f"{path}: line {first}: has a key twice or an empty one; name each column by its key")
     for number, row in rows:
         if len(row) != len(keys):
             raise InputError(f"{path}: line {number}: has {len(row)} values for {len(keys)} keys")
-    return [{key: value for key, value in zip(keys, row, strict=True) if value} for _, row in rows]
+    own = "case" in keys  # where every number is written as 5.0
+    cases = []
+    for number, row in rows:
+        cells = [re.sub(r"\.0$", "", value) if own else value for value in row]
+        given = {key: v for key, v in zip(keys, cells, strict=True) if v and key != "case" and key not in results}
+        cases.append(Line(f"{path}: line {number}", given))
+    return cases
 
 
 def overrides(base: Sequence[str], values: Values) -> tuple[str, ...]:

@@ -214,6 +214,7 @@ def draw_quantities(
     across = min(4, math.ceil(len(quantities) ** 0.5) + 1)
     down = math.ceil(len(quantities) / across)
     warned = [row for rows in families.values() for row in rows if row.get("warnings")]
+    several = len(families) > 1
     figure = Figure(figsize=(3.4 * across, 2.7 * down + 0.5), layout="constrained")
     FigureCanvasAgg(figure)
     for i, (name, heading) in enumerate(quantities.items(), 1):
@@ -223,8 +224,8 @@ def draw_quantities(
             if not points:
                 continue
             axes.plot(
-                [x for x, _ in points], [y for _, y in points], label=family or "here", linewidth=1, markersize=4,
-                color=_COLOURS[j % len(_COLOURS)], marker=_MARKERS[j % len(_MARKERS)],
+                [x for x, _ in points], [y for _, y in points], label=(family or "here") if several else None,
+                linewidth=1, markersize=4, color=_COLOURS[j % len(_COLOURS)], marker=_MARKERS[j % len(_MARKERS)],
             )  # fmt: skip
         if warned:
             ringed = [(row[key], row[name]) for row in warned if row[name] != ""]
@@ -240,7 +241,7 @@ def draw_quantities(
     shown = {
         name: handle for axes in figure.axes for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)
     }
-    if len(shown) > 1:
+    if shown:
         figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=min(4, len(shown)), fontsize=8)
     figure.savefig(path, dpi=150)
 

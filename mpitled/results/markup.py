@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Iterable, Sequence
 from html import escape
 
@@ -92,18 +93,28 @@ def cards(figures: Iterable[tuple[str, str]]) -> str:
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]], *, caption: str = "") -> str:
-    """A table; columns whose cells are all numbers are set to the right. Without headings the first cell is one."""
+    """A table; columns whose cells are all numbers are set to the right. Without headings the first cell is one.
+
+    The last cell of a row that is shorter than the others goes across what it lacks.
+    """
     cells = [list(row) for row in rows]
-    kinds = ["number" * all(map(_is_number, column)) for column in zip(*cells, strict=True)]
+    width = max(map(len, cells), default=0)
+    whole = [row for row in cells if len(row) == width]
+    kinds = ["number" * all(map(_is_number, column)) for column in zip(*whole, strict=True)]
     made = [f"<caption>{escape(caption)}</caption>"] if caption else []
     if headings:
         made.append(
-            _row(f'<th scope="col"{_class(kind)}>{escape(of)}</th>' for of, kind in zip(headings, kinds, strict=True))
+            _row(
+                f'<th scope="col"{_class(kind)}>{_breakable(of)}</th>' for of, kind in zip(headings, kinds, strict=True)
+            )
         )
     for first, *others in cells:
         tag = "td" if headings else 'th scope="row"'
         tags = [f"<{tag}{_class(kinds[0])}>{escape(first)}</{tag[:2]}>"]
-        tags += [f"<td{_class(kind)}>{escape(cell)}</td>" for cell, kind in zip(others, kinds[1:], strict=True)]
+        if lacks := width - 1 - len(others):
+            *others, last = others
+        tags += [f"<td{_class(kind)}>{escape(cell)}</td>" for cell, kind in zip(others, kinds[1:], strict=False)]
+        tags += [f'<td colspan="{1 + lacks}">{escape(last)}</td>'] if lacks else []
         made.append(_row(tags))
     return f'<div class="wide"><table>{"".join(made)}</table></div>'
 
@@ -148,6 +159,11 @@ def folded(summary: str, *parts: str) -> str:
 
 def _row(cells: Iterable[str]) -> str:
     return f"<tr>{''.join(cells)}</tr>"
+
+
+def _breakable(heading: str) -> str:
+    """Escaped, so that a long key of a deck may go on in another line after its dots."""
+    return re.sub(r"(?<=[a-z])\.(?=\w)|(?<=\w)\.(?=[a-z])", ".<wbr>", escape(heading))
 
 
 def _class(kind: str) -> str:

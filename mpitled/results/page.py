@@ -24,14 +24,10 @@ PAGE = "report.html"
 _NO_MATPLOTLIB = "There are no pictures here, for matplotlib is missing: pip install 'mpitled[pictures]'."
 
 
-def write(directory: Path) -> dict[str, Any]:
-    """Write the report of the run in a directory, finished or not, and its page report.html; the report.
-
-    InputError as `report.write`.
-    """
-    made = report.write(directory)
+def write(directory: Path, made: Mapping[str, Any]) -> Path:
+    """Write the page of the run in a directory, finished or not, whose report is made: report.html."""
     atomic.write_text(directory / PAGE, _page(directory, made))
-    return made
+    return directory / PAGE
 
 
 class _Run(NamedTuple):

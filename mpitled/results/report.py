@@ -82,7 +82,14 @@ class Outcome:
 
 
 def write(directory: Path, seconds: Mapping[str, float] | None = None) -> dict[str, Any]:
-    """Compute the report of the run in a directory; writes report.json and the pictures there.
+    """Make the report of the run in a directory, and keep it; errors as both."""
+    report = make(directory, seconds)
+    keep(directory, report)
+    return report
+
+
+def make(directory: Path, seconds: Mapping[str, float] | None = None) -> dict[str, Any]:
+    """Compute the report of the run in a directory, and draw the pictures there, if it lets itself be written.
 
     `seconds` are the phases of a run that is at its end. InputError if the directory holds no results, or they and
     the model do not belong together.
@@ -95,9 +102,12 @@ def write(directory: Path, seconds: Mapping[str, float] | None = None) -> dict[s
     # Of a report that is made again the run knows nothing.
     phases = dict(seconds or report.get("seconds", {}))
     report["seconds"] = phases | {"report": phases.get("report", time.perf_counter() - begin)}
-    report = _without_nan(report)
+    return dict(_without_nan(report))
+
+
+def keep(directory: Path, report: Mapping[str, Any]) -> None:
+    """Write report.json into the run's directory. InputError if the disc refuses."""
     atomic.write_text(directory / REPORT, json.dumps(report, indent=2, allow_nan=False) + "\n")
-    return report
 
 
 def read(directory: Path) -> Outcome:
@@ -374,7 +384,7 @@ def _draw(outcome: Outcome, directory: Path) -> list[str] | str:
     try:
         return plot.draw(directory, outcome.solid, outcome.centre, outcome.title)
     except OSError as error:
-        raise InputError(f"{directory}: pictures cannot be written ({error.strerror})") from None
+        return f"none, for they cannot be written ({error.strerror})"
 
 
 def _without_nan(value: Any) -> Any:

@@ -33,13 +33,15 @@ class World:
 
     def __init__(self, comm: Any = None) -> None:
         """comm: of a group, see `split`; without it all ranks that were started."""
-        if comm is None and any(int(os.environ.get(name, "1")) > 1 for name in _SIZES):
+        sizes = [int(os.environ[name]) for name in _SIZES if name in os.environ]
+        if comm is None and max(sizes, default=1) > 1:
             from mpi4py import MPI
 
             comm = MPI.COMM_WORLD
         self.rank: int = 0 if comm is None else comm.rank
         self.size: int = 1 if comm is None else comm.size
         self.comm: Any = comm if self.size > 1 else None
+        self.started = bool(sizes)  # by a launcher, be it on one rank
         self._host: Any = None
 
     def split(self, size: int) -> World:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import partition
+from mpitled import atomic, lock, store
 from mpitled import deck as decks
-from mpitled import store
 from mpitled.deck import Deck
 from mpitled.errors import InputError, MpitledError, UnstableError, everywhere
 from mpitled.model import WARNING
@@ -34,10 +35,7 @@ def build(deck: Deck, directory: Path, quiet: bool = True) -> tuple[Path, bool]:
             return path, False
         except InputError as error:
             print(f"note: {error}; it is built anew", file=sys.stderr, flush=True)
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{directory}: cannot be made ({error.strerror}); give another folder with --out") from None
+    atomic.make_folder(directory)
     from mpitled import preprocess  # only the rank that builds needs the meshers
 
     if not quiet:
@@ -74,11 +72,13 @@ def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False, resum
 
     With `resume` it goes on from the last checkpoint there, on any number of ranks, or makes what is missing of a
     result that is there; from the start where there is neither. Without, a checkpoint of this very run is not written
-    over but refused, nor is that of another, for it may hold days of work.
+    over but refused, and so is that of another, for it may hold days of work, and a folder in which a run is at
+    work.
 
     The report, on every rank. InputError, UnstableError or InterruptedRun alike on all ranks.
     """
-    with Interrupts(world) as interrupts:
+    with Interrupts(world) as interrupts, ExitStack() as alone:
+        world.on_leader(lambda: alone.enter_context(lock.held(directory, lock.RUN)))
         found = world.on_leader(lambda: _resumable(deck, directory) if resume else _refuse_to_lose(deck, directory))
         if found == DONE:
             return _report(directory, world)

@@ -63,7 +63,7 @@ def predict(path: Path, counts: Sequence[int], cluster: Cluster, out: Path, seed
         # METIS bisects: each of its earlier parts is what the finer parts in a row make up.
         tables = partition.tables(hexahedra, domains, finer[1] // (finer[0] // n_parts), n_parts)
         rows.insert(0, step_time(partition.figures(tables, costs, len(hexahedra)), cluster))
-    out.mkdir(parents=True, exist_ok=True)
+    atomic.make_folder(out)
     written = [{k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows]
     atomic.write_csv(out / "predict.csv", COLUMNS, written)
     try:
@@ -72,7 +72,9 @@ def predict(path: Path, counts: Sequence[int], cluster: Cluster, out: Path, seed
         _say(f"{out}: no picture, for matplotlib is missing")
     else:
         n_cells = len(hexahedra) + len(domains)
-        charts.draw_prediction(rows, f"{n_cells / 1e6:.3g} M cells", cluster.assumptions(), out / "predict.png")
+        path = out / "predict.png"
+        with atomic.writing(path):
+            charts.draw_prediction(rows, f"{n_cells / 1e6:.3g} M cells", cluster.assumptions(), path)
     return rows
 
 
