@@ -1,7 +1,7 @@
 """An example of a picture of one's own, with PyVista: the deformed body cut open, coloured by displacement.
 
 python jobs/pictures.py RUN PICTURE.png [FACTOR] takes the folder of a run; displacements are FACTOR times as large.
-ParaView does the same with RUN/result.vtkhdf: Warp By Vector (field_displacement), then Clip.
+ParaView does the same with RUN/result.vtkhdf: Warp By Vector (displacement), then Clip.
 """
 
 import sys

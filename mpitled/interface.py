@@ -147,7 +147,7 @@ class RunResult:
     @property
     def displacement(self) -> Frames:
         """(n_nodes, 3), m, in each frame: the field u_h, at EFG nodes too."""
-        return self._frames(lambda frame: self._result.at_nodes("field_displacement", frame))
+        return self._frames(lambda frame: self._result.at_nodes("displacement", frame))
 
     @property
     def jacobian(self) -> Frames:
@@ -183,9 +183,9 @@ class RunResult:
         """A frame as pyvista.UnstructuredGrid, undeformed, in metres. InputError without PyVista.
 
         Points are nodes and integration points, with "displacement" (m), the field's. Cells are hexahedra, and vertices
-        for the EFG nodes and, at their integration points, for the support domains: "kind" is 0, 1 and 2 of them. "J"
-        is that of hexahedra and domains, nan of EFG nodes, and "material" the number of their material in the deck,
-        from 0, or -1.
+        for the EFG nodes and, at their integration points, for the support domains: "kind" is 0, 1 and 2 of them. "J",
+        and "stress" (Pa) if the run wrote it, is that of hexahedra and domains, nan of EFG nodes; "material" is the
+        number of their material in the deck, from 0, or -1.
         """
         return self._frames(lambda frame: views.grid(self._result, frame))[frame]
 

@@ -177,7 +177,7 @@ class Faults:
         with store.open_result(folder) as result:
             assert result.complete, f"{folder} is not complete"
             result.check()
-            frames = [[result.at_nodes("displacement", k), result.in_cells("J", k)] for k in range(result.n_frames)]
+            frames = [[result.at_nodes("parameters", k), result.in_cells("J", k)] for k in range(result.n_frames)]
             energies = result.figures["energy_J"]
             numbers = [result.times, *result.series.values(), np.array([*energies.values()])]
         return (*(array for frame in frames for array in frame), *numbers)

@@ -23,7 +23,7 @@ def frame(part: PartRows, k: int) -> tuple[dict[str, Any], dict[str, Any], dict[
     nodes, points = part.nodes[part.owned], part.read("points")[part.owned]
     points = np.concatenate([points, part.read("domain_points")])
     displacement = np.concatenate([np.outer(nodes, [1.0, 10.0, 100.0]), np.zeros((len(part.read("domains")), 3))])
-    point_data = {"displacement": displacement + k, "field_displacement": points * k}
+    point_data = {"parameters": displacement + k, "displacement": points * k}
     return point_data, {"J": 1 + 1e-3 * part.read("cells") + k}, {"energy": 0.5 * k, "step": 10.0 * k}
 
 

@@ -48,7 +48,7 @@ def synthetic(folder, text, displacement=affine):
     metadata = {"deck": deck.canonical(scene), "load_time_s": 2.0, "tumour": tumour}
     writer = store.ResultWriter(folder, None, store.read_part(folder / "model.h5", 1, 0), 1, metadata)
     u = displacement(np.concatenate([model.points, model.domain_points]))
-    writer.write_frame(2.0, {"displacement": u, "field_displacement": u}, {"J": np.ones(model.n_cells)}, {})
+    writer.write_frame(2.0, {"parameters": u, "displacement": u}, {"J": np.ones(model.n_cells)}, {})
     writer.close({})
     return folder
 

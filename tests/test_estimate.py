@@ -96,7 +96,7 @@ def compute(tmp_path):
         path.write_text(text + BRAIN)
         made = job.run(load_deck(path, ("output.pictures=false", *overrides)), tmp_path / "out", World(), quiet=True)
         with open_result(tmp_path / "out") as result:
-            return made, 1e3 * result.at_nodes("displacement", -1)
+            return made, 1e3 * result.at_nodes("parameters", -1)
 
     return compute
 
@@ -142,7 +142,7 @@ def test_what_a_cloud_is_wrong_by_is_told(compute, tmp_path, radius, warned):
     volume = 4e-9 / 3 * np.pi * radius**3
     made, _ = compute(SPHERE.format(volume=1e9 * volume), RELAXED)
     with open_result(tmp_path / "out") as result:
-        field, model = result.at_nodes("field_displacement", -1), read_model(tmp_path / "out" / "model.h5")
+        field, model = result.at_nodes("displacement", -1), read_model(tmp_path / "out" / "model.h5")
     error = 1e3 * distance(field, shell(model, model.points, volume))
     print(f"{radius} mm: {made['cloud_misfit_mm']:.3f} mm told, {error:.3f} mm true")
     assert error / 3 < made["cloud_misfit_mm"] < 3 * error

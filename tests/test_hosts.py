@@ -92,7 +92,7 @@ def test_a_run_over_tcp_has_the_bits_of_one_on_a_single_host(hosts, tmp_path):
     with open_result(tmp_path / "one") as one, open_result(tmp_path / "two") as two:
         assert one.n_frames == two.n_frames == 5
         for frame in range(5):
-            for name in ("displacement", "field_displacement"):
+            for name in ("parameters", "displacement"):
                 assert one.point_data(name, frame).tobytes() == two.point_data(name, frame).tobytes()
             assert one.cell_data("J", frame).tobytes() == two.cell_data("J", frame).tobytes()
         assert {name: values.tobytes() for name, values in one.series.items()} == {

@@ -80,7 +80,7 @@ def test_arrays_are_read_frame_by_frame_in_the_models_order(result):
         assert opened.stress.shape == (3, model.n_cells, 6)
         assert not opened.stress[0].any()
         rows = store.read_part(out / "model.h5", 1, 0)
-        parameters = store.open_result(out).at_nodes("displacement", -1)
+        parameters = store.open_result(out).at_nodes("parameters", -1)
         np.testing.assert_array_equal(opened.stress[-1], cauchy(rows, parameters.T.copy(), "mean"))
     for read in (lambda: opened.points, lambda: last[0]):
         with pytest.raises(package.InputError, match="is closed"):
@@ -121,6 +121,7 @@ def test_what_other_libraries_take(result):
             assert grid.n_points == len(opened.points) + len(store.read_model(out / "model.h5").domains)
             assert np.nanmin(grid.cell_data["J"]) == opened.jacobian[-1].min()
             assert np.array_equal(np.isnan(grid.cell_data["J"]), grid.cell_data["material"] < 0)
+            assert np.nanmax(grid.cell_data["stress"]) == opened.stress[-1].max()
             assert np.array_equal(np.isnan(grid.cell_data["J"]), grid.cell_data["kind"] == 1)  # EFG nodes
             assert np.count_nonzero(grid.cell_data["kind"] == 2) == len(store.read_model(out / "model.h5").domains)
             with pytest.raises(IndexError, match="and no 99"):

@@ -315,7 +315,7 @@ def test_unfinished_results_without_figures(tmp_path):
     writer = store.ResultWriter(tmp_path, None, rows, 3, {"title": "killed", "load_time_s": 2.0, "tumour": None})
     moved = np.full((model.n_nodes + len(model.domains), 3), 1e-3)
     for time in (0.0, 0.5):
-        values = {"displacement": time * moved, "field_displacement": time * moved}
+        values = {"parameters": time * moved, "displacement": time * moved}
         writer.write_frame(time, values, {"J": np.ones(model.n_cells)})
     writer.abandon({"min_jacobian": float("nan"), "peak_memory_bytes": [1, 2]})
     printed = mpitled("report", tmp_path).stdout

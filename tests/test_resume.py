@@ -69,7 +69,7 @@ def held(folder: Path) -> tuple[list[bytes], dict[str, Any]]:
         result.check()
         arrays = [result.times, *result.series.values()]
         for k in range(result.n_frames):
-            arrays += [result.at_nodes("displacement", k), result.at_nodes("field_displacement", k)]
+            arrays += [result.at_nodes("parameters", k), result.at_nodes("displacement", k)]
             arrays += [result.at_integration_points("displacement", k), result.in_cells("J", k)]
         figures = {k: v for k, v in result.figures.items() if k not in OF_THE_MACHINE | {"resumed_at_step"}}
     return [array.tobytes() for array in arrays], figures
@@ -219,7 +219,7 @@ def test_nobody_computes_with_what_is_damaged(stopped, monkeypatch, capsys):
     for path, array, commands in (
         (model, "points", (["report"], ["compare", str(folder)], ["export", "--abaqus", *out], ["partition", "2"])),
         (model, "hexahedra", (["report"], ["partition", "2"], ["predict", "--parts", "2", *out])),
-        (result, "VTKHDF/PointData/field_displacement", (["report"], ["compare", str(folder)])),
+        (result, "VTKHDF/PointData/displacement", (["report"], ["compare", str(folder)])),
         (result, "VTKHDF/FieldData/strain_energy", (["report", "--html"],)),
     ):
         whole = path.read_bytes()

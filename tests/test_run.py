@@ -94,7 +94,7 @@ def test_homogeneous_stretch_has_its_closed_form(tmp_path, cloud):
     with open_result(tmp_path / "out") as result:
         figures = result.figures
         exact = result.points * [0.2, m - 1, m - 1]
-        error = np.linalg.norm(result.point_data("displacement", -1) - exact, axis=1).max()
+        error = np.linalg.norm(result.point_data("parameters", -1) - exact, axis=1).max()
         J = result.in_cells("J", -1)
     assert figures["kinetic_to_internal"]["at_end"] < 1e-4
     # The estimate is of the largest component, and honest to a factor of 3.
@@ -118,7 +118,7 @@ def test_relaxation_reaches_the_static_solution_in_few_steps(tmp_path, cloud):
             figures = result.figures
             m, _ = stretched(1.2)
             exact = result.points * [0.2, m - 1, m - 1]
-            error = np.abs(result.point_data("displacement", -1) - exact).max()
+            error = np.abs(result.point_data("parameters", -1) - exact).max()
             steps[method] = figures["steps"]
             assert result.times[-1] == (1.0 if method == "dynamic-relaxation" else 1.5)  # share of the load, or s
         assert json.loads((tmp_path / method / "report.json").read_text())["load_share"] == 1.0
@@ -145,7 +145,7 @@ def test_a_wave_keeps_its_energy_while_the_step_shortens(tmp_path):
 def final(directory: Path) -> tuple[np.ndarray, np.ndarray]:
     """Displacements of nodes and of integration points in the last frame, in the order of the model."""
     with open_result(directory) as result:
-        return result.at_nodes("field_displacement", -1), result.at_integration_points("displacement", -1)
+        return result.at_nodes("displacement", -1), result.at_integration_points("displacement", -1)
 
 
 @pytest.fixture(scope="module")
@@ -171,7 +171,7 @@ def test_one_two_and_four_ranks_agree_and_repeat(tmp_path, grown):
     one = final(grown("quasi-static"))
     largest = np.abs(one[0]).max()
     with open_result(grown("quasi-static")) as result:
-        moved = np.linalg.norm(result.at_nodes("displacement", -1), axis=1).max()
+        moved = np.linalg.norm(result.at_nodes("parameters", -1), axis=1).max()
     assert moved == pytest.approx(3e-3, rel=1e-3)  # R - r0, the volume having four digits
     for n in (2, 4):
         for other, values in zip(final(tmp_path / str(n)), one, strict=True):
@@ -315,7 +315,7 @@ def test_an_unstable_run_stops_and_says_why(tmp_path, n):
     with open_result(tmp_path / "out") as result:
         assert not result.complete
         assert result.n_frames >= 2  # at rest, and the last good state
-        assert np.abs(result.at_nodes("displacement", -1)).max() > 1e-3
+        assert np.abs(result.at_nodes("parameters", -1)).max() > 1e-3
         assert result.in_cells("J", -1).min() > 0
 
 
@@ -372,7 +372,7 @@ def test_a_result_that_is_not_to_be_trusted_says_so(tmp_path):
     assert not trusted.stderr
     with open_result(tmp_path / "held") as result:
         exact = result.points * [0, 0, -0.5]
-        assert np.abs(result.point_data("field_displacement", -1) - exact).max() < 1e-5
+        assert np.abs(result.point_data("displacement", -1) - exact).max() < 1e-5
 
 
 def test_a_ramp_too_fast_for_any_estimate_says_so(tmp_path):

@@ -344,8 +344,8 @@ def test_an_unfinished_file_holds_the_finished_frames(model_path: Path, tmp_path
         assert result.n_frames == 2
         assert result.figures == ({} if end == "kill" else {"rank": 0, "steps": 7})
         for k, seen in enumerate(frames):
-            assert same(result.point_data("displacement", k), seen["displacement"])
-            assert same(result.at_nodes("displacement", k)[:, 0], np.arange(120.0) + k)
+            assert same(result.point_data("parameters", k), seen["parameters"])
+            assert same(result.at_nodes("parameters", k)[:, 0], np.arange(120.0) + k)
 
 
 def test_what_is_not_a_result_is_refused_in_one_line(model_path: Path, tmp_path: Path) -> None:
@@ -368,7 +368,7 @@ def test_a_frame_holds_what_was_announced(model_path: Path, tmp_path: Path) -> N
     writer = store.ResultWriter(tmp_path, None, part, 1, {})
     point_data, cell_data, _ = frame(part, 0)
     with pytest.raises(ValueError, match="every frame holds"):
-        writer.write_frame(0.0, {"displacement": point_data["displacement"]}, cell_data)
+        writer.write_frame(0.0, {"parameters": point_data["parameters"]}, cell_data)
     with pytest.raises(ValueError, match="values for 60 rows"):
         writer.write_frame(0.0, point_data, {"J": cell_data["J"][1:]})
     writer.write_frame(0.0, point_data, cell_data)

@@ -68,14 +68,14 @@ def _tell(case: Case, run: Case, outcome: Outcome) -> str:
 
         here = replace(
             outcome,
-            field=field("field_displacement", frames, result.at_nodes),
-            displacement=field("displacement", frames, result.at_nodes),
+            field=field("displacement", frames, result.at_nodes),
+            displacement=field("parameters", frames, result.at_nodes),
             domain_displacement=field("displacement", frames, result.at_integration_points),
             jacobian=field("J", frames, result.in_cells),
             time=float(result.times[frames[1]]),
             figures={},
         )
-        off = np.linalg.norm(here.field - field("field_displacement", wide, result.at_nodes), axis=1).max() / 3
+        off = np.linalg.norm(here.field - field("displacement", wide, result.at_nodes), axis=1).max() / 3
     _write(case, run, here, outcome.figures, 1e3 * float(off))
     return ""
 

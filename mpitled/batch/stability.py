@@ -275,7 +275,7 @@ def _field(folder: Path) -> tuple[Model, NDArray[np.float64], float]:
     """The model of a run, the displacement field (n_nodes, 3), m, at its end, and its tolerance, mm."""
     with store.open_result(folder) as result:
         tolerance = float(result.metadata["deck"]["solver"]["tolerance"])
-        return store.read_model(folder / "model.h5"), result.at_nodes("field_displacement", -1), tolerance
+        return store.read_model(folder / "model.h5"), result.at_nodes("displacement", -1), tolerance
 
 
 def summary(rows: list[dict[str, Any]]) -> str:

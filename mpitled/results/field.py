@@ -98,8 +98,8 @@ def open_field(path: Path, frame: int = -1) -> Field:
         support = result.metadata["deck"]["support"]
         return Field(
             model=model,
-            parameters=result.at_nodes("displacement", frame),
-            at_nodes=result.at_nodes("field_displacement", frame),
+            parameters=result.at_nodes("parameters", frame),
+            at_nodes=result.at_nodes("displacement", frame),
             basis=support["basis"],
             weight=support["weight"],
             share=float(result.times[frame] / result.metadata["load_time_s"]),

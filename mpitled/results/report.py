@@ -122,8 +122,8 @@ def read(directory: Path) -> Outcome:
             raise InputError(f"{result.path}: is not of the model beside it, {MODEL}; run the deck again")
         return Outcome(
             model=model,
-            field=result.at_nodes("field_displacement", -1),
-            displacement=result.at_nodes("displacement", -1),
+            field=result.at_nodes("displacement", -1),
+            displacement=result.at_nodes("parameters", -1),
             domain_displacement=result.at_integration_points("displacement", -1),
             jacobian=result.in_cells("J", -1),
             time=float(result.times[-1]),

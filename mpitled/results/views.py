@@ -123,13 +123,16 @@ def grid(result: store.Result, frame: int) -> Any:
     rest = np.setdiff1d(np.arange(len(numbers)), hexahedra)
     cells = {library.CellType.HEXAHEDRON: hexahedra, library.CellType.VERTEX: rest[:, None]}
     made = library.UnstructuredGrid({kind: nodes for kind, nodes in cells.items() if len(nodes)}, result.points)
-    made.point_data["displacement"] = result.point_data("field_displacement", frame)
+    made.point_data["displacement"] = result.point_data("displacement", frame)
+    of_frames = ((name, result.cell_data(name, frame), np.nan) for name in result.names("Cell"))
     for name, values, none in (
-        ("J", result.cell_data("J", frame), np.nan),
+        *of_frames,
         ("material", result.cell_data("material"), -1),
         ("kind", result.cell_data("kind"), store.EFG_NODE),
     ):
-        at_rows = np.full(len(numbers), none, values.dtype)  # of integration points, which are the last cells, in order
+        at_rows = np.full(
+            (len(numbers), *values.shape[1:]), none, values.dtype
+        )  # of integration points, which are the last cells, in order
         at_rows[numbers < 0] = values[len(values) - np.count_nonzero(numbers < 0) :]
         made.cell_data[name] = np.concatenate([values[: len(hexahedra)], at_rows[rest]])
     return made
@@ -156,7 +159,7 @@ def show(path: Path) -> None:
 
         def place(value: float) -> None:
             frame = round(value)
-            field, displacement = (result.at_nodes(name, frame) for name in ("field_displacement", "displacement"))
+            field, displacement = (result.at_nodes(name, frame) for name in ("displacement", "parameters"))
             moved = replace(outcome, field=field, displacement=displacement).moved
             _add(plotter, displaced(solid, moved), 1.0, largest)
             plotter.add_text(f"time {times[frame]:.4g}", name="time", font_size=10)

@@ -431,7 +431,7 @@ class Run:
         self.frames, self.written = self.frames + 1, frame_time
         writer.write_frame(
             frame_time,
-            {"displacement": displacement, "field_displacement": field},
+            {"parameters": displacement, "displacement": field},
             of_cells,
             series,
         )

@@ -19,7 +19,7 @@ from mpitled.store.files import AGAIN, attribute, checksum_of, first_broken, mat
 RESULT_LAYOUT = 2
 FINISHED, UNFINISHED = "result.vtkhdf", "result.partial.vtkhdf"
 #: Of what is in a result, as the attribute "units" of its dataset says too; decks and reports are in mm.
-UNITS = {"Points": "m", "displacement": "m", "field_displacement": "m", "stress": "Pa", "Values": "s"}
+UNITS = {"Points": "m", "displacement": "m", "parameters": "m", "stress": "Pa", "Values": "s"}
 HEXAHEDRON, EFG_NODE, INTEGRATION_POINT = 0, 1, 2
 
 

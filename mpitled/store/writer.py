@@ -83,7 +83,7 @@ class ResultWriter:
         n_frames: int,
         metadata: Mapping[str, Any],
         *,
-        point_data: Mapping[str, int] = MappingProxyType({"displacement": 3, "field_displacement": 3}),
+        point_data: Mapping[str, int] = MappingProxyType({"displacement": 3, "parameters": 3}),
         cell_data: Mapping[str, int] = MappingProxyType({"J": 1}),
         series: Sequence[str] = (),
         frames: int = 0,
