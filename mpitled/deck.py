@@ -220,7 +220,7 @@ class MaterialSection:
     youngs_modulus: float = key("Young's modulus, E", unit="Pa", limits="(0, inf)")
     poissons_ratio: float = key("Poisson's ratio, nu", limits="(-1, 0.5)")
     density: float = key("density", 1000.0, "kg/m3", "(0, inf)")
-    cells: tuple[str, ...] = key("names of cell sets", ("all",))
+    cells: tuple[str, ...] = key("names of cell sets; all: what no other material names", ("all",))
 
     @property
     def material(self) -> Material:

@@ -28,6 +28,10 @@ OUTER = ("skull", "surface")
 GREATEST_GROWTH = 8.0
 #: Young's modulus of the tissue around a tumour below which it is more likely one in kPa or MPa, Pa.
 SOFTEST = 50.0
+#: Poisson's ratio up to which results are known (jobs/studies/README.md).
+LEAST_COMPRESSIBLE = 0.499
+#: A seed's radius below which it is more likely one in metres, m, and its share of a tumour that is most of it.
+SMALLEST_SEED, LARGEST_SEED = 5e-5, 0.5
 
 
 def read_mesh(deck: Deck) -> Mesh:
@@ -164,6 +168,7 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
             *replaced,
             *checks.scene_remarks(points, mesh.hexahedra, domains, n_fe_nodes, dofs),
             *_slips(deck, mesh, material, materials),
+            *_unheld(mesh, dofs),
             *(_growth_remarks(deck) if len(domains) else ()),
         ),
     )
@@ -193,6 +198,11 @@ def _slips(deck: Deck, mesh: Mesh, material: NDArray[np.int16], materials: tuple
         if not 1 <= modulus <= 1e12:
             told.add(section.name)
             yield f"warning: {name}.youngs_modulus = {modulus:.10g}: is it in Pa? Brain tissue has about 3000"
+        if section.poissons_ratio > LEAST_COMPRESSIBLE:
+            yield (
+                f"warning: {name}.poissons_ratio = {section.poissons_ratio:.10g}: results are known up to "
+                f"{LEAST_COMPRESSIBLE:g}; take 0.49, or {LEAST_COMPRESSIBLE:g} at most"
+            )
         if not 100 <= section.density <= 25000:
             yield f"warning: {name}.density = {section.density:.10g}: is it in kg/m3? Tissue has about 1000"
     if deck.tumour is None:
@@ -209,11 +219,29 @@ def _slips(deck: Deck, mesh: Mesh, material: NDArray[np.int16], materials: tuple
         yield f"warning: {what}: is softer than any tissue that a tumour grows in; moduli are in Pa"
 
 
+def _unheld(mesh: Mesh, dofs: NDArray[np.int64]) -> Iterator[str]:
+    """A warning of a tumour that nothing is held against, though its own nodes keep the body in place."""
+    seed = _members(mesh, TUMOUR)
+    names = [name for name in OUTER if name in mesh.node_sets]
+    if len(seed) and names and not len(np.setdiff1d(dofs // 3, seed)):
+        yield (
+            "warning: no node but the tumour's is held, so that the whole body gives way to it; add [[fixed]] with "
+            f'nodes = "{names[0]}"'
+        )
+
+
 def _growth_remarks(deck: Deck) -> Iterator[str]:
     """Warnings of a tumour that a cloud is not known to take."""
     if deck.tumour is None:
         return
     radius, seed = sphere_radius(deck.tumour.volume), deck.tumour.seed_radius
+    if seed < SMALLEST_SEED:
+        yield f"warning: tumour.seed_radius = {1e3 * seed:.10g}: is in mm; does it look like metres?"
+    if (share := (seed / radius) ** 3) > LARGEST_SEED:
+        yield (
+            f"warning: tumour.seed_radius = {1e3 * seed:.10g}: {share:.0%} of tumour.volume is there at the start and "
+            "moves nothing, and only the rest is grown; make it smaller"
+        )
     grows = f"warning: the tumour grows to a radius of {length(radius)}"
     if radius > GREATEST_GROWTH * seed:
         times = f"{radius / seed:.3g} times its seed's"

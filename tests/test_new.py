@@ -142,11 +142,16 @@ def test_a_tumour_that_no_cloud_is_known_to_take_is_warned_of(tmp_path):
         ([], []),
         (["tumour.volume=7240"], ["12 mm, beyond the cloud's 11 mm; enlarge cloud.radius"]),
         (["tumour.volume=3054", "tumour.seed_radius=1.0"], ["9 mm, 9 times its seed's, .* enlarge tumour.seed_radius"]),
+        (["tumour.seed_radius=4.0"], ["seed_radius = 4: 51% of tumour.volume is there at the start"]),
+        (["material.brain.poissons_ratio=0.4995"], ["poissons_ratio = 0.4995: results are known up to 0.499"]),
     ):
         remarks = overview.figures(path, keys)["remarks"]
-        assert len(remarks) == len(words)
+        assert len(remarks) == len(words), remarks
         for remark, word in zip(remarks, words, strict=True):
             assert re.search(word, remark)
+    path.write_text(TUMOUR.replace('[[fixed]]\nnodes = "surface"\n', ""))
+    (remark,) = overview.figures(path)["remarks"]
+    assert re.search('no node but the tumour.s is held, .* with nodes = "surface"', remark)
 
 
 def test_a_centre_that_looks_like_metres_is_said_so(tmp_path):
@@ -196,7 +201,7 @@ def test_check_says_where_the_tumour_is_and_how_large(tmp_path):
     assert figures["radius_mm"] == pytest.approx(5, rel=1e-4)
     assert figures["distance_mm"] == {"surface": pytest.approx(20)}
     assert figures["side"] == ""  # nobody knows which side of a block is left
-    line = "tumour           (24, 20, 20) mm; 523.6 mm3, radius 2 -> 5 mm; 20 mm from the surface"
+    line = "tumour           (24, 20, 20) mm; 523.6 mm3, 490.09 of it grown, radius 2 -> 5 mm; 20 mm from the surface"
     assert line in overview.check(path).splitlines()
 
 
@@ -212,7 +217,9 @@ def test_check_says_on_which_side_of_a_brain_the_tumour_is(tmp_path):
     assert 10 < apart["skull"] < 60
     said = overview.check(path, coarse)
     near = r"\d+(\.\d)? mm from the left ventricle, \d+(\.\d)? mm from the skull"
-    lies = re.escape("tumour           (-32, -20, 10) mm, left of the middle; 2000 mm3, radius 2 -> 7.82 mm; ")
+    lies = re.escape(
+        "tumour           (-32, -20, 10) mm, left of the middle; 2000 mm3, 1966.5 of it grown, radius 2 -> 7.82 mm; "
+    )
     assert re.search(f"^{lies}{near}$", said, re.MULTILINE)
 
 

@@ -120,7 +120,9 @@ def _tumour(tumour: Tumour, mesh: Mesh, *, x_is_right: bool) -> Item:
     side = "" if abs(across) < _MIDDLE else "right" if across > 0 else "left"
     told = [*ventricles[:1], *(name for name in preprocess.OUTER if name in apart)]
     text = f"{in_millimetres(centre)}{side and f', {side} of the middle'}"
-    text += f"; {1e9 * tumour.volume:.10g} mm3, radius {1e3 * tumour.seed_radius:g} -> {length(radius)}"
+    grown = tumour.volume - 4 / 3 * np.pi * tumour.seed_radius**3
+    text += f"; {1e9 * tumour.volume:.10g} mm3, {1e9 * grown:.5g} of it grown, radius {1e3 * tumour.seed_radius:g} -> "
+    text += length(radius)
     if told:
         text += "; " + ", ".join(f"{length(apart[name])} from the {name.replace('_', ' ')}" for name in told)
     figures = {
