@@ -78,6 +78,7 @@ class Told:
     title: str
     folder: Path
     cases: Sequence[Entry]
+    base: Sequence[str]  # overrides for all
 
     @property
     def keys(self) -> list[str]:
@@ -90,7 +91,6 @@ class Sweep(Told):
     """All cases of a deck in a folder, to be computed."""
 
     cases: Sequence[Case]
-    base: tuple[str, ...]  # overrides for all
     ranks: int  # of each case
     one_growth: bool = False  # whether the largest tumour alone is run, and the others are on its way
 
@@ -199,13 +199,14 @@ def _read_manifest(folder: Path) -> _Manifest:
 
 def told(folder: Path) -> Told:
     """What was swept in a folder, though the deck be another by now, or gone; a note says so."""
-    deck, title, _, _, _, values, names = _read_manifest(folder)
+    deck, title, base, _, _, values, names = _read_manifest(folder)
     try:
         return read(folder)
     except (InputError, OSError):
         print(f"note: {folder}: {deck}, or a file that it reads, is not what was swept any more", file=sys.stderr)
     pairs = enumerate(zip(values, names, strict=True), 1)
-    return Told(deck, title, folder, [Entry(number, given, folder / name) for number, (given, name) in pairs])
+    entries = [Entry(number, given, folder / name) for number, (given, name) in pairs]
+    return Told(deck, title, folder, entries, base)
 
 
 def read(folder: Path) -> Sweep:

@@ -301,11 +301,21 @@ def _html(sweep: Told, table: Table, charts: Sequence[Path]) -> str:
         "quantities": f"Charts of the results against {table.keys[0]}",
         "cost": "Chart of the distance from the static solution in mm against the time of the loop in s",
     }
+    captions = {
+        "quantities": "Lines join the cases in their order, between which nothing was computed. The misfit is what the "
+        "cloud is uncertain by at its worst node; the volume balance, what of the grown volume was not found again.",
+        "cost": "How far each case ended from rest, by its own estimate, against the time that its steps took.",
+    }
     warned = warnings(table)
     rows = [line.cells + [line.remark] * bool(line.remark) for line in lines]
     parts = {
         "Results": [markup.table(headings, rows), *([markup.note(warned)] if warned else [])],
-        "Charts": [markup.picture(path.read_bytes(), alt[path.stem]) for path in charts],
+        "Charts": [markup.picture(path.read_bytes(), alt[path.stem], captions[path.stem]) for path in charts],
     }
     head = [markup.text(f"{n} cases of {sweep.deck.name}, varied: {', '.join(table.keys)}", "faint")]
+    if sweep.base:
+        head.append(markup.text(f"All of them with {', '.join(sweep.base)}", "faint"))
+    head.append(
+        markup.text(f"Pages of single cases: mpitled report {sweep.cases[0].folder} --html, and so on", "faint")
+    )
     return markup.page(title, head, list(parts.items()))
