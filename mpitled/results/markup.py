@@ -38,7 +38,7 @@ nav { display: flex; flex-wrap: wrap; gap: 0.3rem 1.2rem; margin-top: 1rem; }
 a { color: var(--accent); }
 p { max-width: 60rem; margin: 0 0 1rem; }
 .faint { color: var(--faint); }
-.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(11rem, 1fr)); gap: 0.8rem; margin: 1.2rem 0; }
+.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(9.4rem, 1fr)); gap: 0.8rem; margin: 1.2rem 0; }
 .card { border: 1px solid var(--line); border-radius: 6px; padding: 0.6rem 0.9rem; background: var(--ground); }
 .card b { display: block; font-size: 1.35rem; font-variant-numeric: tabular-nums; }
 .card span { color: var(--faint); font-size: 0.88rem; }

@@ -200,7 +200,7 @@ def _in_space(run: _Run) -> Iterator[str]:
         shown = ", ".join(views.parts(run.solid))
         yield markup.picture(
             path.read_bytes(),
-            f"{shown.capitalize()} seen at an angle and from above, before and after, coloured after by displacement",
+            f"{shown.capitalize()} seen at an angle and from above, before and after, tissue coloured by displacement",
             f"{shown.capitalize()} before and after, in parallel projection, drawn by {by}.",
         )
 
@@ -212,6 +212,8 @@ def _displacement(run: _Run) -> Iterator[str]:
         rows.append(("largest, outside the tumour's first ring of cells", f"{outside:.2f} mm"))
     walls = made.get("max_displacement_of_ventricle_wall_mm", {})
     rows += [(f"largest, wall of the {side} ventricle", f"{moved:.2f} mm") for side, moved in walls.items()]
+    if (shift := made.get("midline_shift_mm")) is not None:
+        rows.append((f"midline, to the {'right' if shift > 0 else 'left'}", f"{abs(shift):.2f} mm"))
     rows += [(f"moved more than 5 mm, share of {of}", f"{share:.2%}") for of, share in made["share_over_5mm"].items()]
     yield markup.table([], rows)
     if model.n_nodes > model.n_fe_nodes:

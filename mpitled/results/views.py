@@ -27,6 +27,8 @@ from mpitled.results.solid import Solid, displaced
 #: Of parts, told apart by the colour-blind (Okabe and Ito 2008), and the map of displacements, as in the cuts.
 COLOURS = {"tumour": "#d55e00", "left ventricle": "#0072b2", "right ventricle": "#56b4e9", "body": "#d9d4cc"}
 MAP = "magma_r"
+#: Moves all alike, and so far that it would be black.
+_PLAIN = {"tumour"}
 _THIN = 0.4  # opacity of the body around the parts
 _SCALARS = "displacement (mm)"
 _LONGEST = 120  # s that PyVista may take for the pictures
@@ -189,7 +191,6 @@ _Paint = Callable[[Any, View, float], None]  # of matplotlib's axes, with a shar
 
 def _draw(directory: Path, path: Path, painter: Callable[[Solid], _Paint]) -> None:
     """A row for each view, before and after, with what the colours mean."""
-    from matplotlib import colormaps
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
@@ -214,13 +215,13 @@ def _draw(directory: Path, path: Path, painter: Callable[[Solid], _Paint]) -> No
             )  # fmt: skip
             if 0 in solid.sides:
                 name_sides(axes, solid.sides[0])
-    figure.colorbar(
-        ScalarMappable(_norm(solid), MAP), ax=panels[:, 1], label="after: displacement (mm)", shrink=0.6, pad=0.02
-    )
-    shown = [Patch(facecolor=COLOURS[name], label=f"before: {name}") for name in parts(solid)]
-    if len(solid.tumour):  # its surface moves so far that it hardly looks coloured
-        moved = float(np.linalg.norm(solid.displacement[solid.tumour], axis=-1).mean())
-        shown.append(Patch(facecolor=colormaps[MAP](_norm(solid)(moved)), label="after: tumour"))
+    if parts(solid).keys() - _PLAIN:
+        figure.colorbar(
+            ScalarMappable(_norm(solid), MAP), ax=panels[:, 1], label="after: displacement (mm)", shrink=0.6, pad=0.02
+        )
+    shown = [
+        Patch(facecolor=COLOURS[name], label=name if name in _PLAIN else f"before: {name}") for name in parts(solid)
+    ]
     if "body" not in parts(solid):
         shown.append(
             Patch(facecolor=COLOURS["body"], alpha=_THIN, label="before and after: surface of the body behind them")
@@ -230,9 +231,12 @@ def _draw(directory: Path, path: Path, painter: Callable[[Solid], _Paint]) -> No
 
 
 def _norm(solid: Solid) -> Any:
+    """Of the displacements (mm) of what is coloured by them."""
     from matplotlib.colors import Normalize
 
-    return Normalize(0.0, float(np.linalg.norm(solid.displacement, axis=1).max()) or 1.0)
+    coloured = [triangles.ravel() for name, triangles in parts(solid).items() if name not in _PLAIN]
+    shown = np.concatenate(coloured) if coloured else slice(None)
+    return Normalize(0.0, float(np.linalg.norm(solid.displacement[shown], axis=1).max()) or 1.0)
 
 
 def _renderer(solid: Solid) -> _Paint:
@@ -270,7 +274,8 @@ def _add(plotter: Any, solid: Solid, share: float, largest: float) -> None:
         body = _surface(solid, solid.surface, share)
         plotter.add_mesh(body, color=COLOURS["body"], opacity=_THIN, culling="front", name="around", **light)
     for name, triangles in shown.items():
-        paint = {"scalars": _SCALARS, "cmap": MAP, "clim": (0, largest)} if share else {"color": COLOURS[name]}
+        moved = share and name not in _PLAIN
+        paint = {"scalars": _SCALARS, "cmap": MAP, "clim": (0, largest)} if moved else {"color": COLOURS[name]}
         plotter.add_mesh(_surface(solid, triangles, share), name=name, **paint, **light)
 
 
@@ -295,6 +300,8 @@ def _painter(solid: Solid) -> _Paint:
     plain = np.repeat([to_rgb(COLOURS[name]) for name in shown], [len(of) for of in shown.values()], axis=0)
     size = np.linalg.norm(solid.displacement, axis=1)[triangles].mean(axis=1)
     moved = colormaps[MAP](norm(size))[:, :3]
+    alike = np.repeat([name in _PLAIN for name in shown], [len(of) for of in shown.values()])
+    moved[alike] = plain[alike]
 
     def paint(axes: Any, view: View, share: float) -> None:
         places = solid.points + share * solid.displacement
