@@ -1,15 +1,17 @@
 """A result back on the grid of the label image that it came from, as NIfTI files for 3D Slicer and others of ITK.
 
 Vectors are in mm along the axes of the image's world, x right, y front, z up, as NIfTI has them whichever way voxels
-run. Their files have the intent of displacements (1006), by which ITK from 5.4 on, and Slicer from 5.2.2 on, turn them
-into their own axes as they read them. Where there is no tissue (outside the body, inside the seed before and the tumour
-after it has grown) displacements are zero: between its last voxel and that beyond no interpolated vector is to be
-trusted.
+run. Their files have the intent of displacements (1006), by which ITK (from 5.4 on) and Slicer (since 2023) turn them
+into axes of their own, left and back, as they read them. A field that is read as a transform is to them one that leads
+from places of the warped image to those of the image to warp: the inverse one. Where there is no tissue (outside the
+body, inside the seed before and the tumour after it has grown) displacements are zero, so that what is interpolated
+between such a voxel and the next means nothing.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,11 +62,11 @@ def write_nifti(run: Path, directory: Path) -> Written:
 
     Two fields (x, y, z, 1, 3), float32: displacements of the tissue that was at the voxels' middles, and those that
     lead from the middles back to where the tissue came from that is there now, as resampling an image asks for. And
-    the labels (x, y, z) as the tissue has carried them, each voxel that of the place where its middle came from; the
-    tumour has the largest label and one more. InputError if the run has no image, or not that one, or the disc refuses.
+    the labels (x, y, z) as the tissue has carried them, with the tumour's the largest and one more. InputError if the
+    run has no image, or not the one that there is, or the disc refuses.
     """
     field = open_field(run)
-    image, body = _image_of(field, run)
+    image, body, ventricles = _image_of(field, run)
     room.check_memory(_BYTES * float(body.size), f"{image.path}: its {body.size:.3g} voxels", "cut it to the head")
     seed, tumour = _balls(field)
     atomic.make_folder(directory)
@@ -83,15 +85,15 @@ def write_nifti(run: Path, directory: Path) -> Written:
         tissue = ~tumour.holds(places)
         index, places = index[tissue], places[tissue]
     origins = field.origins(places)
-    before = np.floor((origins.place - image.origin) / image.voxel).astype(int)[:, ::-1]
+    before = (origins.place - image.origin)[:, ::-1] / image.voxel[::-1]  # in voxels, each from i to i + 1
     known = np.asarray(((before >= 0) & (before < body.shape)).all(axis=1))
-    known[known] = body[tuple(before[known].T)]
+    known[known] = body[tuple(before[known].astype(int).T)]
     index, before = index[known], before[known]
     back = _vectors(image, index, (origins.place - places)[known])
     _write(paths[1], image, back, "from deformed places back to undeformed, mm")
 
     labels = np.where(body, 0, image.labels).astype(np.int64)
-    labels[tuple(index.T)] = image.labels[tuple(before.T)]
+    labels[tuple(index.T)] = _carried(image, body, ventricles, before)
     label, about = None, "labels as tissue carried them"
     if tumour:
         label = int(image.labels.max()) + 1
@@ -103,8 +105,34 @@ def write_nifti(run: Path, directory: Path) -> Written:
     return Written(paths, label, missed, field.share, field.complete)
 
 
-def _image_of(field: Field, run: Path) -> tuple[Image, Cells]:
-    """The label image of a run, and its voxels (nz, ny, nx) of the body; InputError if it is not what it was."""
+def _carried(image: Image, body: Cells, ventricles: Sequence[Cells], before: NDArray[np.float64]) -> NDArray[np.int32]:
+    """Labels (n,) of voxels whose middles came from the places before (n, 3), in voxels by z, y, x.
+
+    It is the label of the voxel that holds the place, but for the ventricles: where all moves by less than half a
+    voxel that would change no label at all, and a ventricle that shrinks would keep its volume. So each has as many
+    voxels as its share of all of them adds up to, those with the largest shares, as the mesh has of it hexahedra.
+    """
+    part = np.zeros(len(before), np.int8)
+    for number, mask in enumerate(ventricles, 1):
+        share = ndimage.map_coordinates(mask.astype(np.float32), before.T - 0.5, order=1, mode="nearest")
+        n = round(float(share.sum(dtype=float)))
+        share[part > 0] = 0
+        part[np.argsort(-share, kind="stable")[:n]] = number
+    labels = np.empty(len(before), np.int32)
+    rest = body & ~np.any([np.zeros_like(body), *ventricles], axis=0)
+    for number, mask in enumerate((rest, *ventricles)):
+        nearest = ndimage.distance_transform_edt(~mask, image.voxel[::-1], return_distances=False, return_indices=True)
+        own = part == number
+        at = tuple(before[own].astype(int).T)
+        labels[own] = image.labels[tuple(of[at] for of in nearest)]
+    return labels
+
+
+def _image_of(field: Field, run: Path) -> tuple[Image, Cells, list[Cells]]:
+    """The label image of a run, its voxels (nz, ny, nx) of the body, and those of each ventricle.
+
+    InputError if it is not there or not what it was.
+    """
     with damaged(run, "run the deck again"):
         given = field.metadata["deck"].get("labels")
         if not given:
@@ -135,7 +163,7 @@ def _image_of(field: Field, run: Path) -> tuple[Image, Cells]:
     # Hexahedra are centred on the body, and the layers that its volume takes or leaves are less than two.
     if np.abs(ends - [nodes.min(axis=0), nodes.max(axis=0)]).max() > 2 * labels.element_size + image.voxel.max():
         raise InputError(f"{path}: lies elsewhere than when {run} was computed; {remedy}")
-    return image, body
+    return image, body, list(parts.values())
 
 
 def _balls(field: Field) -> tuple[_Ball, _Ball] | tuple[None, None]:
