@@ -192,6 +192,22 @@ def test_whichever_way_voxels_run_the_world_is_the_same(run, tmp_path, axes):
         np.testing.assert_array_equal(data.reshape(len(i), -1), same[i, j, k].reshape(len(i), -1))
 
 
+def test_an_image_in_metres_has_results_in_millimetres(run, tmp_path):
+    image, kept = nibabel.load(run.image), run.image.read_bytes()
+    in_metres = nibabel.Nifti1Image(array(image), np.diag([1e-3, 1e-3, 1e-3, 1]) @ image.affine)
+    in_metres.header.set_xyzt_units("meter")
+    try:
+        nibabel.save(in_metres, run.image)
+        mpitled("export", run.folder, "--nifti", "--out", tmp_path / "export")
+    finally:
+        run.image.write_bytes(kept)
+    written = exported(tmp_path, "displacement")
+    assert written.header.get_xyzt_units()[0] == "mm"
+    np.testing.assert_allclose(written.affine, image.affine, rtol=1e-6)
+    there = np.isclose(array(written)[:, :, :, 0], run.u, rtol=1e-3, atol=1e-5).all(axis=3)
+    assert there.mean() > 0.999  # the header's float32 moves voxels by less than a micrometre, some to another domain
+
+
 @pytest.mark.parametrize(
     ("kind", "most", "wider"), [("u1", 200, "u1"), ("u1", 255, "i2"), ("i4", 2**31 - 1, "i8"), ("f4", 90, "f4")]
 )
@@ -255,6 +271,15 @@ def test_what_is_missing_is_told_in_a_line(run, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "nibabel", None)
     line = complaint(mpitled("export", run.folder, "--nifti", status=2))
     assert line.endswith("label images need nibabel; install it: pip install 'mpitled[images]'")
+
+
+def test_an_undeformed_body_is_where_it_was(run):
+    """As the first frame of a run that was stopped at once."""
+    still = field.open_field(run.folder, 0)
+    places = 1e-3 * run.places[(run.before > 0) & (np.linalg.norm(run.places - CENTRE, axis=3) > SEED)]
+    origins = still.origins(places)
+    np.testing.assert_allclose(origins.place, places, rtol=0, atol=1e-6)  # where Newton is content
+    assert origins.missed.max() <= 1e-6
 
 
 def test_of_an_unfinished_run_the_last_frame_is_written(run, tmp_path, monkeypatch):

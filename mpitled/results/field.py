@@ -114,7 +114,7 @@ class Field:
             better = size < least[moving]
             least[moving[better]], best[moving[better]] = size[better], at[better]
             step = np.linalg.solve(np.eye(3) + gradient, apart[..., None])[..., 0]
-            trial[moving] = at - step * np.minimum(1, _STEP / np.linalg.norm(step, axis=1))[:, None]
+            trial[moving] = at - step * (_STEP / np.maximum(np.linalg.norm(step, axis=1), _STEP))[:, None]
             moving = moving[least[moving] > _CLOSE]
         return best
 

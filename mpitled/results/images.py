@@ -30,7 +30,7 @@ DISPLACEMENT, INVERSE, LABELS = "displacement.nii.gz", "inverse_displacement.nii
 
 _DISPLACEMENT_VECTORS = 1006  # NIFTI_INTENT_DISPVECT
 _ALIGNED = 2  # how an affine is meant that the file itself does not have, as nibabel says it
-_BYTES = 150  # of memory that a voxel takes, at the most
+_VOXEL_BYTES, _BODY_BYTES = 80, 350  # of memory that a voxel takes, and one of the body beside that, at the most
 _SAME = 1e-6  # of a volume: more than its sums are off by, less than a voxel
 
 
@@ -56,6 +56,14 @@ class _Ball:
         """Which places (n, 3), m, lie inside."""
         return np.asarray(((places - self.centre) ** 2).sum(axis=1) < self.radius**2)
 
+    def voxels(self, image: Image) -> Cells:
+        """The image's voxels (nz, ny, nx) whose middles lie inside."""
+        x, y, z = (
+            (image.origin[i] + image.voxel[i] * (np.arange(n) + 0.5) - self.centre[i]) ** 2
+            for i, n in enumerate(image.labels.shape[::-1])
+        )
+        return np.asarray(z[:, None, None] + y[:, None] + x < self.radius**2)
+
 
 def write_nifti(run: Path, directory: Path) -> Written:
     """Write the last frame of a run's folder into a directory, on the voxels of the deck's label image.
@@ -67,7 +75,8 @@ def write_nifti(run: Path, directory: Path) -> Written:
     """
     field = open_field(run)
     image, body, ventricles = _image_of(field, run)
-    room.check_memory(_BYTES * float(body.size), f"{image.path}: its {body.size:.3g} voxels", "cut it to the head")
+    needed = _VOXEL_BYTES * body.size + _BODY_BYTES * float(body.sum())
+    room.check_memory(needed, f"{image.path}: its {body.size:.3g} voxels", "cut it to the head")
     seed, tumour = _balls(field)
     atomic.make_folder(directory)
     paths = [directory / name for name in (DISPLACEMENT, INVERSE, LABELS)]
@@ -97,8 +106,7 @@ def write_nifti(run: Path, directory: Path) -> Written:
     label, about = None, "labels as tissue carried them"
     if tumour:
         label = int(image.labels.max()) + 1
-        everywhere = np.argwhere(np.ones_like(body))
-        labels[tuple(everywhere[tumour.holds(_middles(image, everywhere))].T)] = label
+        labels[tumour.voxels(image)] = label
         about = f"{about}; {label}: tumour"
     _write(paths[2], image, labels, about)
     missed = float(origins.missed[known].max(initial=0))
@@ -110,7 +118,7 @@ def _carried(image: Image, body: Cells, ventricles: Sequence[Cells], before: NDA
 
     It is the label of the voxel that holds the place, but for the ventricles: where all moves by less than half a
     voxel that would change no label at all, and a ventricle that shrinks would keep its volume. So each has as many
-    voxels as its share of all of them adds up to, those with the largest shares, as the mesh has of it hexahedra.
+    voxels as its share of all of them adds up to, those with the largest shares; the mesh takes its hexahedra alike.
     """
     part = np.zeros(len(before), np.int8)
     for number, mask in enumerate(ventricles, 1):
