@@ -147,11 +147,19 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
     predict.add_argument("--out", type=Path, metavar="DIR", help="folder of predict.csv and predict.png (the model's)")
 
     export = command(
-        "export", "write a model as decks that run to the same result here, and elsewhere if volumes change little"
+        "export",
+        "write a model as decks that run to the same result here, and elsewhere if volumes change little, or a result "
+        "as images for 3D Slicer",
     )
     _model(export)
-    export.add_argument("--abaqus", action="store_true", required=True, help="as Abaqus decks and a CSV table")
-    export.add_argument("--out", type=Path, metavar="DIR", help="folder of the decks (export beside the model)")
+    kind = export.add_mutually_exclusive_group(required=True)
+    kind.add_argument("--abaqus", action="store_true", help="the model as Abaqus decks and a CSV table")
+    kind.add_argument(
+        "--nifti",
+        action="store_true",
+        help="a result on the voxels of its label image: displacements, their inverse, deformed labels",
+    )
+    export.add_argument("--out", type=Path, metavar="DIR", help="folder of the files (export beside the model)")
 
     info = command("info", "versions of what mpitled works with, and what is missing; or of a file", json=True)
     info.add_argument(

@@ -254,11 +254,28 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
+    path = _model(options.model)
+    out = options.out or path.parent / "export"
+    if options.nifti:
+        _export_images(path.parent, out)
+        return
     from mpitled import export
 
-    path = _model(options.model)
-    for written in export.write_abaqus(path, options.out or path.parent / "export"):
+    for written in export.write_abaqus(path, out):
         print(written)
+
+
+def _export_images(run: Path, out: Path) -> None:
+    from mpitled.results import images
+
+    written = images.write_nifti(run, out)
+    if not written.complete:
+        told = f"{run}: is not complete; the images are of its last frame, at {written.share:.1%} of the load"
+        print(f"note: {told}", file=sys.stderr)
+    print(*written.paths, sep="\n")
+    if written.tumour is not None:
+        print(f"label {written.tumour} of {images.LABELS} is the tumour")
+    print(f"{images.INVERSE} leads back to within {1e3 * written.missed:.2g} mm at its worst voxel")
 
 
 def _model(path: Path) -> Path:

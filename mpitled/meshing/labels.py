@@ -134,20 +134,7 @@ def mesh_labels(
 def label_cells(labels: deck.Labels) -> Head:
     """The cubes of tissue and ventricles of a label image; errors as `mesh_labels`."""
     image = read_image(Path(labels.image))
-    wanted = {name: getattr(labels, name) for name in ("tissue", *VENTRICLES) if len(getattr(labels, name))}
-    numbers = [number for several in wanted.values() for number in several]
-    if twice := sorted({number for number in numbers if numbers.count(number) > 1}):
-        raise InputError(f"{image.path}: label {twice[0]} is given twice in [labels]; a voxel is of one part only")
-    voxels = {name: _voxels(image, name, several) for name, several in wanted.items()}
-    body, remarks = _body(image, voxels)
-    if all(name in voxels for name in VENTRICLES):
-        left, right = (np.nonzero(voxels[name])[2].mean() for name in VENTRICLES)
-        if left > right:
-            remarks.append(
-                f"warning: labels.left_ventricle lies right of labels.right_ventricle in {image.path}; swap them"
-            )
-    voxels = {name: mask & body for name, mask in voxels.items() if name in VENTRICLES}
-
+    body, voxels, remarks = parts_of(image, labels)
     size = labels.element_size
     if size < image.voxel.min():
         remarks.append(
@@ -176,6 +163,26 @@ def label_cells(labels: deck.Labels) -> Head:
     counts |= {f"image_{name}": float(share.sum()) for name, share in shares.items()}
     figures = {f"{name}_volume_m3": n * size**3 for name, n in counts.items()}
     return Head(grid, solid, deep, parts, figures, image.to_world, tuple(remarks))
+
+
+def parts_of(image: Image, labels: deck.Labels) -> tuple[Cells, dict[str, Cells], list[str]]:
+    """Voxels (nz, ny, nx) of the body, one piece without cavities, those of it in each ventricle, and remarks.
+
+    Raises InputError for labels that are missing or given twice.
+    """
+    wanted = {name: getattr(labels, name) for name in ("tissue", *VENTRICLES) if len(getattr(labels, name))}
+    numbers = [number for several in wanted.values() for number in several]
+    if twice := sorted({number for number in numbers if numbers.count(number) > 1}):
+        raise InputError(f"{image.path}: label {twice[0]} is given twice in [labels]; a voxel is of one part only")
+    voxels = {name: _voxels(image, name, several) for name, several in wanted.items()}
+    body, remarks = _body(image, voxels)
+    if all(name in voxels for name in VENTRICLES):
+        left, right = (np.nonzero(voxels[name])[2].mean() for name in VENTRICLES)
+        if left > right:
+            remarks.append(
+                f"warning: labels.left_ventricle lies right of labels.right_ventricle in {image.path}; swap them"
+            )
+    return body, {name: mask & body for name, mask in voxels.items() if name in VENTRICLES}, remarks
 
 
 def read_image(path: Path) -> Image:

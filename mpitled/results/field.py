@@ -20,9 +20,10 @@ from mpitled.solver.support import moving_least_squares
 #: Where a value came from: inside a hexahedron, a support domain, or the hexahedron next to a place outside the mesh.
 IN_HEXAHEDRON, IN_CLOUD, OUTSIDE = 0, 1, 2
 
-_CANDIDATES = (16, 64)  # hexahedra with the nearest middles that are tried, and tried again where that fails
+_CANDIDATES = (1, 16, 64)  # hexahedra with the nearest middles that are tried, and more where a nearer one may be
 _INSIDE = 1 + 1e-9  # in reference coordinates: a place on a face belongs to either cell
 _ITERATIONS = 30  # of Newton; sound cells need 4
+_STEPS, _STEP, _CLOSE = 12, 1e-3, 1e-6  # of Newton in the cloud: most steps, the longest, m, and a miss that is none, m
 _CHUNK = 1 << 12  # places at once, so that the temporaries stay small
 # The eight sign products of the corners, whose coefficients make the trilinear map a polynomial.
 _r, _s, _t = CORNERS.T.astype(float)
@@ -35,6 +36,13 @@ class Values(NamedTuple):
     displacement: NDArray[np.float64]  # (n, 3), m
     source: NDArray[np.int8]  # (n,), IN_HEXAHEDRON, IN_CLOUD or OUTSIDE
     outside: NDArray[np.float64]  # (n,), m from the mesh; 0 inside
+
+
+class Origins(NamedTuple):
+    """Places of the undeformed body for places (n, 3) of the deformed one."""
+
+    place: NDArray[np.float64]  # (n, 3), m
+    missed: NDArray[np.float64]  # (n,), m: how far from the given places the field takes them
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +73,53 @@ class Field:
         fe = source != IN_CLOUD
         displacement[fe] = np.einsum("na,nai->ni", _shapes(xi[fe]), self.parameters[model.hexahedra[cells[fe]]])
         if not fe.all():
-            nearest = cKDTree(model.domain_points).query(places[~fe])[1]
-            nodes = model.domains[nearest]
-            values, _, _ = moving_least_squares(model.points[nodes], places[~fe], self.basis, self.weight)
-            displacement[~fe] = np.einsum("na,nai->ni", values, self.parameters[nodes])
+            displacement[~fe] = self._in_cloud(places[~fe])[0]
         return Values(displacement, source, np.where(fe, outside, 0.0))
+
+    def origins(self, places: NDArray[np.float64]) -> Origins:
+        """Where in the undeformed body the tissue was that is at places (n, 3), m, of the deformed one.
+
+        In hexahedra and beside them that is the inverse of their map, to round-off; in the cloud it is found by Newton,
+        for along the surface of a grown tumour displacements grow too steeply for a fixed-point iteration. As the field
+        jumps from one support domain to the next, a few places in the cloud are met to within such a jump only.
+        """
+        model, n = self.model, len(places)
+        cells, xi, outside = locate(model.points + self.parameters, model.hexahedra, places)
+        cloud = np.zeros(n, bool)
+        if len(model.domains):
+            cloud = self._across_interface(cells, xi) & (outside > 0)
+        found, missed = np.empty((n, 3)), np.zeros(n)
+        fe = ~cloud
+        found[fe] = np.einsum("na,nai->ni", _shapes(xi[fe]), model.points[model.hexahedra[cells[fe]]])
+        if cloud.any():
+            there = found[cloud] = self._origins_in_cloud(places[cloud])
+            missed[cloud] = np.linalg.norm(there + self.at(there).displacement - places[cloud], axis=1)
+        return Origins(found, missed)
+
+    def _origins_in_cloud(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The best of a few Newton steps from the integration points that come nearest to places (n, 3)."""
+        points = self.model.domain_points
+        trial = points[cKDTree(points + self._in_cloud(points)[0]).query(places)[1]]
+        best, least = trial.copy(), np.full(len(places), np.inf)
+        moving = np.arange(len(places))
+        for _ in range(_STEPS):
+            at = trial[moving]
+            displacement, gradient = self._in_cloud(at)
+            apart = at + displacement - places[moving]
+            size = np.linalg.norm(apart, axis=1)
+            better = size < least[moving]
+            least[moving[better]], best[moving[better]] = size[better], at[better]
+            step = np.linalg.solve(np.eye(3) + gradient, apart[..., None])[..., 0]
+            trial[moving] = at - step * (_STEP / np.maximum(np.linalg.norm(step, axis=1), _STEP))[:, None]
+            moving = moving[least[moving] > _CLOSE]
+        return best
+
+    def _in_cloud(self, places: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Displacements (n, 3), m, by the nearest integration points' support domains, and gradients (n, 3, 3)."""
+        nodes = self.model.domains[cKDTree(self.model.domain_points).query(places)[1]]
+        values, gradients, _ = moving_least_squares(self.model.points[nodes], places, self.basis, self.weight)
+        parameters = self.parameters[nodes]
+        return np.einsum("na,nai->ni", values, parameters), np.einsum("naj,nai->nij", gradients, parameters)
 
     def _across_interface(self, cells: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Places (n,) that lie beyond a face, an edge or a corner of their hexahedron, whichever is nearest, with
@@ -120,14 +170,18 @@ def locate(
     cells, xi, distance = np.zeros(n, np.int64), np.zeros((n, 3)), np.full(n, np.inf)
     if not len(hexahedra):
         return cells, xi, distance
-    tree = cKDTree(points[hexahedra].mean(axis=1))
+    middles = points[hexahedra].mean(axis=1)
+    reach = max(np.linalg.norm(points[corner] - middles, axis=1).max() for corner in hexahedra.T)
+    tree = cKDTree(middles)
     missed = np.arange(n)
     for k in _CANDIDATES:
+        nearer = np.zeros(n, bool)  # whether a hexahedron that was not tried may come nearer
         for first in range(0, len(missed), _CHUNK):
             rows = missed[first : first + _CHUNK]
-            near = tree.query(places[rows], min(k, len(hexahedra)))[1].reshape(len(rows), -1)
+            apart, near = (of.reshape(len(rows), -1) for of in tree.query(places[rows], min(k, len(hexahedra))))
             cells[rows], xi[rows], distance[rows] = _best(points, hexahedra, near, places[rows])
-        missed = np.flatnonzero(distance > 0)
+            nearer[rows] = distance[rows] > np.maximum(apart[:, -1] - reach, 0)
+        missed = np.flatnonzero(nearer)
     return cells, xi, distance
 
 
@@ -157,10 +211,15 @@ def _inverse(corners: NDArray[np.float64], at: NDArray[np.float64]) -> tuple[NDA
     modes = _MODES @ corners / 8
     size = np.abs(modes[:, 1:4]).max(axis=(1, 2))[:, None]
     xi = np.zeros_like(at)
+    moving = np.arange(len(at))
     for _ in range(_ITERATIONS):
-        step = np.linalg.solve(_slopes(modes, xi, size), (at - _place(modes, xi))[..., None])[..., 0]
-        xi = np.clip(xi + np.clip(step, -2, 2), -8, 8)
-        if np.abs(step).max(initial=0) < 1e-13:
+        before, some = xi[moving], modes[moving]
+        apart = (at[moving] - _place(some, before))[..., None]
+        step = np.linalg.solve(_slopes(some, before, size[moving]), apart)[..., 0]
+        xi[moving] = np.clip(before + np.clip(step, -2, 2), -8, 8)
+        # Those at a bound, which come no nearer, are done as well.
+        moving = moving[np.abs(xi[moving] - before).max(axis=1) >= 1e-13]
+        if not len(moving):
             break
     return xi, np.abs(at - _place(modes, xi)).max(axis=1) < 1e-9 * size[:, 0]
 
