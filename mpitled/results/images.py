@@ -146,7 +146,7 @@ def _image_of(field: Field, run: Path) -> tuple[Image, Cells, list[Cells]]:
         if not given:
             raise InputError(f"--nifti: the scene of {run} has no [labels], and so no image to go back to")
         labels = deck.Labels(
-            image=Path(given["image"]),
+            image=Path(field.metadata["folder"]) / given["image"],
             element_size=1e-3 * given["element_size"],
             tissue=tuple(given["tissue"]),
             **{name: tuple(given[name]) for name in VENTRICLES},
@@ -154,8 +154,7 @@ def _image_of(field: Field, run: Path) -> tuple[Image, Cells, list[Cells]]:
     path = labels.image
     remedy = "give back the image that the deck was run with, or run the deck again"
     if not path.is_file():
-        where = "" if path.is_absolute() else ", or export from the folder where the deck was run"
-        raise InputError(f"{path}: the label image of {run} is not there; put it back{where}")
+        raise InputError(f"{path}: the label image of {run} is not there; put it back")
     image = read_image(path)
     try:
         body, parts, _ = parts_of(image, labels)

@@ -403,6 +403,7 @@ class Run:
         return {
             "deck": decks.canonical(self.deck),
             "title": self.deck.title,
+            "folder": str(Path.cwd()),  # that paths of the deck are from, where they are not absolute
             "versions": {name: importlib.metadata.version(name) for name in ("mpitled", "numpy", "numba", "h5py")},
             "ranks": self.world.size,
             "partition": self.about["partition"],
