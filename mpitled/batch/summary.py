@@ -97,7 +97,7 @@ def collect(sweep: Told, beside: Path | None = None) -> Table:
         rows.append(given | figures | warned | {"failure": "not computed" if failure is None else failure})
         times.append({"case": case.number} | {column.name: _figure(found, column.key) for column in TIMES})
     theirs = _read_beside(beside, sweep.keys, rows) if beside else {}
-    return Table(sweep.keys, rows, times, theirs, beside.name if beside else "")
+    return Table(sweep.keys, rows, times, theirs, beside.stem if beside else "")
 
 
 def write(sweep: Told, table: Table) -> list[Path]:

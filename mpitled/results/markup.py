@@ -48,6 +48,8 @@ p { max-width: 60rem; margin: 0 0 1rem; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 caption { text-align: left; font-weight: 600; padding: 0.3rem 0; }
 th, td { padding: 0.3rem 0.9rem 0.3rem 0; text-align: left; border-bottom: 1px solid var(--line); vertical-align: top; }
+table.dense { font-size: 0.86rem; }
+.dense th, .dense td { padding-right: 0.55rem; }
 td.number, th.number { text-align: right; }
 td.bar { width: 20rem; min-width: 8rem; }
 td.bar div { height: 0.9rem; margin-top: 0.3rem; background: var(--accent); }
@@ -58,6 +60,10 @@ details { margin: 0 0 1.2rem; }
 summary { cursor: pointer; color: var(--accent); margin-bottom: 0.4rem; }
 pre { overflow-x: auto; background: var(--ground); border: 1px solid var(--line); padding: 0.8rem; font-size: 0.85rem; }
 @media print { section { break-inside: avoid; } nav { display: none; } }"""
+
+
+#: A table of more columns is set close, so that all of them are seen at once.
+_MANY = 8
 
 
 def page(title: str, head: Sequence[str], sections: Sequence[tuple[str, Sequence[str]]]) -> str:
@@ -116,7 +122,8 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]], *, caption: st
         tags += [f"<td{_class(kind)}>{escape(cell)}</td>" for cell, kind in zip(others, kinds[1:], strict=False)]
         tags += [f'<td colspan="{1 + lacks}">{escape(last)}</td>'] if lacks else []
         made.append(_row(tags))
-    return f'<div class="wide"><table>{"".join(made)}</table></div>'
+    kind = "dense" * (width > _MANY)
+    return f'<div class="wide"><table{_class(kind)}>{"".join(made)}</table></div>'
 
 
 def bars(caption: str, unit: str, values: Sequence[tuple[str, float]]) -> str:
