@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -145,7 +146,9 @@ def grid_points(shape: tuple[int, int, int], size: tuple[float, float, float]) -
 def named_set(sets: dict[str, NDArray[np.int64]], name: str, origin: str) -> NDArray[np.int64]:
     """The set of that name; an InputError that lists the sets there are, if there is none or it is empty."""
     if name not in sets:
-        raise InputError(f"{origin}: there is no set '{name}'; sets: {', '.join(sorted(sets)) or 'none'}")
+        near = difflib.get_close_matches(name, sets, 1)
+        meant = f"did you mean '{near[0]}'? Sets: " if near else "sets: "
+        raise InputError(f"{origin}: there is no set '{name}'; {meant}{', '.join(sorted(sets)) or 'none'}")
     if len(sets[name]) == 0:
         raise InputError(f"{origin}: the set '{name}' is empty")
     return sets[name]

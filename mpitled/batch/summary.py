@@ -33,6 +33,7 @@ COLUMNS = (
     _Column("left_ml", "ventricle_volume_change_ml.left", "left ventricle, change, ml", "{:+.3f}"),
     _Column("right_ml", "ventricle_volume_change_ml.right", "right ventricle, change, ml", "{:+.3f}"),
     _Column("total_ml", "ventricle_volume_change_ml.total", "ventricles, change, ml", "{:+.3f}"),
+    _Column("midline_shift_mm", "midline_shift_mm", "midline, to the right, mm", "{:+.2f}"),
     _Column("max_displacement_mm", "max_displacement_mm", "largest displacement, mm", "{:.2f}"),
     _Column("share_over_5mm_nodes", "share_over_5mm.nodes", "over 5 mm, share of nodes", "{:.2%}"),
     _Column("share_over_5mm_volume", "share_over_5mm.volume", "over 5 mm, share of volume", "{:.2%}"),

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import LogLocator, PercentFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, PercentFormatter
 from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 
@@ -234,6 +234,7 @@ def draw_quantities(
                 markersize=10, color=_INK, markerfacecolor="none",
             )  # fmt: skip
         axes.set(xlabel=label, ylabel=heading)
+        axes.xaxis.set_major_locator(MaxNLocator(5))
         if name in percentages:
             axes.yaxis.set_major_formatter(PercentFormatter(1.0))
             axes.set_ylim(bottom=0.0)

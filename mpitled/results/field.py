@@ -97,8 +97,13 @@ class Field:
         return Origins(found, missed)
 
     def _origins_in_cloud(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The best of a few Newton steps from the integration points that come nearest to places (n, 3)."""
-        points = self.model.domain_points
+        """The best of a few Newton steps from the integration points that come nearest to places (n, 3).
+
+        What moving least squares say inside of a tumour's seed is no tissue's: a place there is no origin, however well
+        it fits.
+        """
+        points, tumour = self.model.domain_points, self.metadata.get("tumour")
+        centre, seed = (np.array(tumour["centre_m"]), tumour["seed_radius_m"]) if tumour else (np.zeros(3), 0.0)
         trial = points[cKDTree(points + self._in_cloud(points)[0]).query(places)[1]]
         best, least = trial.copy(), np.full(len(places), np.inf)
         moving = np.arange(len(places))
@@ -107,7 +112,7 @@ class Field:
             displacement, gradient = self._in_cloud(at)
             apart = at + displacement - places[moving]
             size = np.linalg.norm(apart, axis=1)
-            better = size < least[moving]
+            better = (size < least[moving]) & (np.linalg.norm(at - centre, axis=1) >= seed)
             least[moving[better]], best[moving[better]] = size[better], at[better]
             step = np.linalg.solve(np.eye(3) + gradient, apart[..., None])[..., 0]
             trial[moving] = at - step * (_STEP / np.maximum(np.linalg.norm(step, axis=1), _STEP))[:, None]

@@ -18,9 +18,9 @@ from mpitled.results import markup, report
 from mpitled.results.report import LARGE, Outcome
 from mpitled.results.solid import Solid
 from mpitled.solver import hexahedra
+from mpitled.solver.job import PAGE
 from mpitled.speed import dry
 
-PAGE = "report.html"
 _NO_MATPLOTLIB = "There are no pictures here, for matplotlib is missing: pip install 'mpitled[pictures]'."
 
 

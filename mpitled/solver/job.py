@@ -20,7 +20,7 @@ from mpitled.solver.progress import Interrupts, Phases
 from mpitled.solver.run import Run
 from mpitled.solver.subdomain import PRECISIONS, cell_costs, localise
 
-MODEL = "model.h5"
+MODEL, PAGE = "model.h5", "report.html"
 #: Said of a run that is at its end.
 DONE = "done"
 
@@ -81,6 +81,9 @@ def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False, resum
         world.on_leader(lambda: alone.enter_context(lock.held(directory, lock.RUN)))
         found = world.on_leader(lambda: _resumable(deck, directory) if resume else _refuse_to_lose(deck, directory))
         if found == DONE:
+            if world.leads and not quiet:
+                said = "is complete already, and only its report is made; without --resume it is computed anew"
+                print(f"note: {directory}: {said}", file=sys.stderr, flush=True)
             return _report(directory, world)
         run = prepare(deck, directory, world, quiet=quiet, found=found)
         try:
@@ -102,6 +105,9 @@ def _report(directory: Path, world: World, seconds: Mapping[str, float] | None =
 
     def write() -> dict[str, Any]:
         store.discard_checkpoints(directory)
+        if seconds is not None:  # of a result that took the place of another
+            with atomic.writing(directory / PAGE):
+                (directory / PAGE).unlink(missing_ok=True)
         return report.write(directory, seconds)
 
     return dict(world.on_leader(write))

@@ -134,7 +134,10 @@ class Run:
                 if self.world.on_leader(lambda: store.discard_checkpoints(self.directory)):
                     self._tell("a checkpoint that is damaged is discarded")
                 if store.is_finished(self.directory):
-                    self._tell("the result of an earlier run is there, and replaced when this one is done")
+                    self._tell(
+                        "the result of an earlier run is there, and replaced with its page when this one is done; "
+                        "what was exported of it stays"
+                    )
         writer = store.ResultWriter(
             self.directory,
             self.world.comm,
@@ -236,6 +239,8 @@ class Run:
                     raise
                 self.recoveries += 1
                 anew = self.recoveries == ANEW and self.loaded is None
+                how = "the load begins anew, more slowly" if anew else "it goes back a little and on more slowly"
+                self._tell(f"the run was about to become unstable: {how} ({self.recoveries} of {RECOVERIES} times)")
                 while len(self.saved) > 1:
                     self.saved.pop()
                 if anew and isinstance(method, Relaxation):
