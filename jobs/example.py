@@ -45,7 +45,7 @@ model = mpitled.build_model(deck)
 print(f"{model.n_nodes} nodes, {len(model.hexahedra)} hexahedra, {len(model.domains)} support domains")
 
 # %% The run: what it writes into the folder is what `mpitled run` writes.
-report = mpitled.run_deck(deck, folder / "out")
+report = mpitled.run(deck, folder / "out")
 print(f"largest displacement {report['max_displacement_mm']:.2f} mm, smallest J {report['min_jacobian']:.3f}")
 
 # %% The result: arrays are read when they are asked for.

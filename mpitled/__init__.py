@@ -1,6 +1,6 @@
 """Brain deformation by tumour growth: coupled FE/EFG, Total Lagrangian Explicit Dynamics, on MPI ranks.
 
-In Python: `load_deck`, `build_model`, `run_deck`, `open_result` and `open_sweep`, see `mpitled.interface`.
+In Python: `load_deck`, `build_model`, `run`, `open_result` and `open_sweep`, see `mpitled.interface`.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from mpitled.errors import InputError, InterruptedRun, MpitledError, UnstableErr
 
 if TYPE_CHECKING:
     from mpitled.deck import load_deck
-    from mpitled.interface import build_model, open_result, open_sweep, run_deck
+    from mpitled.interface import build_model, open_result, open_sweep, run
 
 __version__ = "0.1.0"
 __all__ = [
     "InputError", "InterruptedRun", "MpitledError", "UnstableError", "__version__", "build_model", "load_deck",
-    "open_result", "open_sweep", "run_deck",
+    "open_result", "open_sweep", "run",
 ]  # fmt: skip
 
 

@@ -25,7 +25,7 @@ from mpitled.results import views
 from mpitled.solver import job
 from mpitled.solver.halo import World
 
-__all__ = ["Frames", "RunResult", "build_model", "load_deck", "open_result", "open_sweep", "run_deck"]
+__all__ = ["Frames", "RunResult", "build_model", "load_deck", "open_result", "open_sweep", "run"]
 
 #: More than this is no small thing to hold at once, bytes.
 _LARGEST = 1 << 30
@@ -39,7 +39,7 @@ def build_model(deck: Deck | str | Path, overrides: str | Sequence[str] = ()) ->
     return preprocess.build(_loaded(deck, overrides))
 
 
-def run_deck(
+def run(
     deck: Deck | str | Path,
     directory: str | Path,
     overrides: str | Sequence[str] = (),

@@ -31,7 +31,7 @@ def result(tmp_path_factory):
         "output.frames=2",
         "output.stress=true",
     ]
-    return out, package.run_deck(CUBE, out, keys)
+    return out, package.run(CUBE, out, keys)
 
 
 def test_importing_costs_nothing():
@@ -43,7 +43,7 @@ def test_importing_costs_nothing():
     took, heavy, _ = done.stdout.split()
     assert float(took) < 0.1
     assert heavy == "False"
-    assert {"load_deck", "build_model", "run_deck", "open_result", "open_sweep"} <= {*dir(package)}
+    assert {"load_deck", "build_model", "run", "open_result", "open_sweep"} <= {*dir(package)}
     with pytest.raises(AttributeError, match="no_such_thing"):
         _ = package.no_such_thing
 
@@ -89,7 +89,7 @@ def test_arrays_are_read_frame_by_frame_in_the_models_order(result):
 
 
 def test_a_result_without_stress_says_how_to_have_it(tmp_path):
-    package.run_deck(CUBE, tmp_path, ["block.elements=[3,3,3]", "solver.method=dynamic-relaxation"])
+    package.run(CUBE, tmp_path, ["block.elements=[3,3,3]", "solver.method=dynamic-relaxation"])
     with package.open_result(tmp_path) as opened, pytest.raises(package.InputError, match=r"output\.stress = true"):
         _ = opened.stress
 

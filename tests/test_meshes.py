@@ -198,7 +198,7 @@ def test_constraints_and_materials_of_the_files_count_with_those_of_the_deck(voi
     np.testing.assert_array_equal(model.prescribed_dofs, (3 * skull[:, None] + np.arange(3)).ravel())
     assert not any(" replaces what " in remark for remark in model.remarks)
     edit(scene, 'nodes = "skull"', 'nodes = "scull"')
-    with pytest.raises(InputError, match="no set 'scull'; did you mean 'skull'. Sets: interface, skull"):
+    with pytest.raises(InputError, match=r"no set 'scull'; did you mean 'skull'\? Sets: interface, skull"):
         build(load_deck(scene))
 
 
