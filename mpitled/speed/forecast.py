@@ -40,8 +40,8 @@ class Forecast(NamedTuple):
     def describe(self) -> str:
         """In a line."""
         least = "at least " if self.at_least else ""
-        steps = f"{least}{self.steps} steps of {1e3 * self.step_s:.2g} ms: {least}{self.loop_s:.2g} s of them"
-        return f"{steps} on one rank here; {room.told(self.output_bytes)} of results"
+        steps = f"{least}{self.steps} steps of {1e3 * self.step_s:.2g} ms, so {least}{self.loop_s:.2g} s of stepping"
+        return f"{steps}, on one rank here; {room.told(self.output_bytes)} of results"
 
 
 def measure(method: March | Relaxation) -> tuple[dict[str, float], float]:
