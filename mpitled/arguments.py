@@ -166,7 +166,7 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
         "file",
         type=Path,
         nargs="?",
-        help="model, result, checkpoint, table or label image: what it holds, and whether it is whole",
+        help="model, result, checkpoint, table, label image or folder of a run: what it holds, and whether it is whole",
     )
     return made
 

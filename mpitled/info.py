@@ -52,16 +52,26 @@ def contents(path: Path) -> dict[str, Any]:
 
     InputError if it is none of these, or damaged. Of tables, which have no checksums, only the outlines are read.
     """
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; give a file in it, model.h5 or result.vtkhdf")
     from mpitled.meshing import labels
 
+    path = _file_of(path)
     if labels.is_image(path):
         return {"kind": "image", "path": str(path), **labels.contents(path)}
     if path.is_file() and (what := _elsewhere(path)):
         raise InputError(f"{path}: {what}")
     with damaged(path, "build the model anew, or run the deck again"):
         return _contents(path)
+
+
+def _file_of(path: Path) -> Path:
+    """A file, or of the folder of a run its result, or where there is none the model."""
+    if not path.is_dir():
+        return path
+    there = (path / name for name in ("result.partial.vtkhdf", "result.vtkhdf", "model.h5"))
+    found = next(filter(Path.exists, there), None)
+    if found is None:
+        raise InputError(f"{path}: is a folder without a result or a model; give a file, or the folder of a run")
+    return found
 
 
 def _elsewhere(path: Path) -> str:
@@ -112,6 +122,7 @@ def _contents(path: Path) -> dict[str, Any]:
 
 def describe(path: Path) -> str:
     """The same for people to read."""
+    path = _file_of(path)
     has = contents(path)
     if has["kind"] == "model":
         from mpitled import store

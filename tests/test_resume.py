@@ -210,6 +210,16 @@ def test_info_names_what_is_damaged(stopped, monkeypatch, capsys):
             assert status == 0 or str(path) in said.err
 
 
+def test_info_of_a_folder_is_of_its_result(stopped, capsys, tmp_path):
+    _, folder = stopped
+    for where, said, status in ((folder, "result.partial.vtkhdf: an unfinished result", 0), (tmp_path / "none", "", 2)):
+        where.mkdir(exist_ok=True)
+        with pytest.raises(SystemExit) as end:
+            cli.main(["info", str(where)])
+        assert end.value.code == status
+        assert said in capsys.readouterr().out
+
+
 def test_nobody_computes_with_what_is_damaged(stopped, monkeypatch, capsys):
     """A number that is as plausible as the one that it took the place of."""
     deck, folder = stopped
