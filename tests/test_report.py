@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import complaint, mpitled
+from conftest import ROOT, complaint, mpitled
 
 from mpitled import info, store
 from mpitled.deck import Cloud, load_deck
@@ -395,7 +395,8 @@ def test_info_of_the_machine_and_of_files(grown):
     assert importlib.metadata.version("numba") in printed
     assert "a whole result" in mpitled("info", grown[0] / "result.vtkhdf").stdout
     assert "a whole model" in mpitled("info", grown[0] / "model.h5").stdout
-    assert "folder" in complaint(mpitled("info", grown[0], status=2))
+    assert mpitled("info", grown[0]).stdout == mpitled("info", grown[0] / "result.vtkhdf").stdout
+    assert "is a folder without a result" in complaint(mpitled("info", ROOT, status=2))
 
 
 def test_info_knows_the_files_around_a_run(tmp_path):
