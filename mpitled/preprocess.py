@@ -44,9 +44,7 @@ def read_mesh(deck: Deck) -> Mesh:
         raise InputError(f"{deck.path}: {error}") from None
     if not deck.spheres:
         return mesh
-    # Of a diagonal: corners of all would be the largest array of the building.
-    of_hexahedra = (mesh.points[mesh.hexahedra[:, 0]] + mesh.points[mesh.hexahedra[:, 6]]) / 2
-    middles = np.concatenate([of_hexahedra, mesh.integration_points])
+    middles = _middles(mesh)
     cell_sets = dict(mesh.cell_sets)
     apart = _bounding(deck)
     for sphere in deck.spheres:
@@ -210,13 +208,17 @@ def _slips(deck: Deck, mesh: Mesh, material: NDArray[np.int16], materials: tuple
     centre = np.asarray(deck.tumour.centre)
     if said := looks_like_metres(centre, mesh.points.min(axis=0), mesh.points.max(axis=0)):
         yield f"warning: tumour.centre = {in_millimetres(centre)}: {said}"
-    # Of a diagonal: corners of all would be the largest array of the building.
-    of_hexahedra = (mesh.points[mesh.hexahedra[:, 0]] + mesh.points[mesh.hexahedra[:, 6]]) / 2
-    middles = np.concatenate([of_hexahedra, mesh.integration_points])
-    grows_in = materials[material[((middles - centre) ** 2).sum(axis=1).argmin()]]
+    grows_in = materials[material[((_middles(mesh) - centre) ** 2).sum(axis=1).argmin()]]
     if grows_in.youngs_modulus < SOFTEST and grows_in.name not in told:
         what = f"material.{grows_in.name}.youngs_modulus = {grows_in.youngs_modulus:.10g}"
         yield f"warning: {what}: is softer than any tissue that a tumour grows in; moduli are in Pa"
+
+
+def _middles(mesh: Mesh) -> NDArray[np.float64]:
+    """Places (n_cells, 3), m, in the middle of hexahedra, and the integration points."""
+    # Of a diagonal: corners of all would be the largest array of the building.
+    of_hexahedra = (mesh.points[mesh.hexahedra[:, 0]] + mesh.points[mesh.hexahedra[:, 6]]) / 2
+    return np.concatenate([of_hexahedra, mesh.integration_points])
 
 
 def _unheld(mesh: Mesh, dofs: NDArray[np.int64]) -> Iterator[str]:
@@ -386,8 +388,8 @@ def _materials(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int16], tuple[Materia
     """Material of each cell, and the materials: those that the deck names first, then those of the mesh's own file.
 
     "all" fills what no other set of the deck claims; what the deck leaves over is of the file's materials, of which
-    the others are none of the model's. Ventricles
-    of which the deck says that there are none need no material, and may have one.
+    the others are none of the model's. Ventricles of which the deck says that there are none need no material, and may
+    have one.
     """
     absent = {name for name in labels.VENTRICLES if deck.labels and not getattr(deck.labels, name)}
     claims = [(name, section.material) for section in deck.materials for name in section.cells if name not in absent]

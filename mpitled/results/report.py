@@ -290,11 +290,7 @@ def _ventricles(outcome: Outcome, fe_volumes: NDArray[np.float64]) -> dict[str, 
     """Volumes of the ventricles' hexahedra, their change (negative: they shrink), and how far their walls moved."""
     model = outcome.model
     before, change, wall = {}, {}, {}
-    for side, name in VENTRICLES.items():
-        cells = model.cell_sets.get(name, np.empty(0, np.int64))
-        cells = cells[cells < len(model.hexahedra)]
-        if len(cells) == 0:
-            continue
+    for side, cells in _in_ventricles(model).items():
         after = hexahedra.volumes(model.points + outcome.field, model.hexahedra[cells])
         before[side] = 1e6 * float(fe_volumes[cells].sum())
         change[side] = 1e6 * float((after - fe_volumes[cells]).sum())
@@ -310,6 +306,13 @@ def _ventricles(outcome: Outcome, fe_volumes: NDArray[np.float64]) -> dict[str, 
     }
 
 
+def _in_ventricles(model: Model) -> dict[str, NDArray[np.int64]]:
+    """Hexahedra of each ventricle that there is, left first."""
+    sets = {side: model.cell_sets.get(name, np.empty(0, np.int64)) for side, name in VENTRICLES.items()}
+    found = {side: cells[cells < len(model.hexahedra)] for side, cells in sets.items()}
+    return {side: cells for side, cells in found.items() if len(cells)}
+
+
 def _midline_shift(outcome: Outcome, fe_volumes: NDArray[np.float64]) -> float | None:
     """How far what lies between the ventricles moves across the midline, mm: the largest, above 0 to the right.
 
@@ -317,10 +320,10 @@ def _midline_shift(outcome: Outcome, fe_volumes: NDArray[np.float64]) -> float |
     hexahedron of it those count that lie as far front and back, up and down as the ventricles do. None without two.
     """
     model = outcome.model
-    walls = [model.cell_sets.get(name, np.empty(0, np.int64)) for name in VENTRICLES.values()]
-    if not all(map(len, walls)):
+    sides = _in_ventricles(model)
+    if len(sides) < 2:
         return None
-    nodes = [np.unique(model.hexahedra[cells[cells < len(model.hexahedra)]]) for cells in walls]
+    nodes = [np.unique(model.hexahedra[cells]) for cells in sides.values()]
     left, right = (model.points[of].mean(axis=0) for of in nodes)
     across = (right - left) / np.linalg.norm(right - left)
     from_plane = model.points @ across - (left + right) @ across / 2

@@ -132,9 +132,8 @@ def grid(result: store.Result, frame: int) -> Any:
         ("material", result.cell_data("material"), -1),
         ("kind", result.cell_data("kind"), store.EFG_NODE),
     ):
-        at_rows = np.full(
-            (len(numbers), *values.shape[1:]), none, values.dtype
-        )  # of integration points, which are the last cells, in order
+        # Of integration points, which are the last cells, in order.
+        at_rows = np.full((len(numbers), *values.shape[1:]), none, values.dtype)
         at_rows[numbers < 0] = values[len(values) - np.count_nonzero(numbers < 0) :]
         made.cell_data[name] = np.concatenate([values[: len(hexahedra)], at_rows[rest]])
     return made

@@ -131,8 +131,7 @@ def _refuse_to_lose(deck: Deck, directory: Path) -> None:
     found = checkpoint.newest(directory)
     if found is None:
         return
-    other = checkpoint.other(found.told, deck, decks.model_key(deck, included(deck)))
-    if other:
+    if other := checkpoint.other(found.told, deck, decks.model_key(deck, included(deck))):
         raise InputError(
             f"{found.path}: holds a run {checkpoint.reached(found.told)} that {other}; give this one another folder "
             "with --out, or remove the file"
