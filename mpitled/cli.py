@@ -52,7 +52,7 @@ def main(words: Sequence[str] | None = None) -> NoReturn:
 
 def _end(error: Exception, status: int) -> NoReturn:
     """One message, and the end of every rank: alike if all know of the error, else by aborting the job."""
-    from mpitled.solver.halo import World
+    from mpitled.parallel.halo import World
 
     world = World()
     if getattr(error, "everywhere", False) or world.size == 1:
@@ -67,7 +67,7 @@ def _missing(error: ImportError) -> NoReturn:
     """A library that is not there or cannot be loaded, maybe the one that ranks speak through."""
     print(f"mpitled: {error}; 'mpitled info' says what is missing and how to get it", file=sys.stderr, flush=True)
     if "mpi4py.MPI" in sys.modules:
-        from mpitled.solver.halo import World
+        from mpitled.parallel.halo import World
 
         World().abort(2)
     sys.exit(2)
@@ -77,7 +77,7 @@ def _log_phases() -> None:
     """Phases of the work on stderr, with the time and the rank."""
     import logging
 
-    from mpitled.solver.halo import World
+    from mpitled.parallel.halo import World
 
     logging.basicConfig(format=f"%(asctime)s rank {World().rank}: %(message)s", level=logging.WARNING)
     logging.getLogger("mpitled").setLevel(logging.INFO)
@@ -101,8 +101,8 @@ def _output(options: argparse.Namespace) -> Path:
 def _run(options: argparse.Namespace) -> None:
     from mpitled.deck import load_deck
     from mpitled.errors import everywhere
-    from mpitled.solver.halo import World
-    from mpitled.solver.job import run
+    from mpitled.job import run
+    from mpitled.parallel.halo import World
     from mpitled.solver.progress import INTERRUPTS
 
     world = World()
@@ -113,7 +113,7 @@ def _run(options: argparse.Namespace) -> None:
     if options.dry:
         if options.json:
             raise InputError("run --dry: is for people; mpitled check DECK --json has its figures")
-        from mpitled.speed.dry import dry_run
+        from mpitled.preview.dry_run import dry_run
 
         told = dry_run(deck, _output(options), world, verbose=options.verbose)
         if world.leads:
@@ -145,7 +145,7 @@ def _refuse_sweep(folder: Path) -> None:
 def _sweep(options: argparse.Namespace) -> int:
     from mpitled.batch import cases, growth, summary, sweep, vary
     from mpitled.errors import everywhere
-    from mpitled.solver.halo import World
+    from mpitled.parallel.halo import World
 
     world = World()
     with everywhere():  # each rank reads the same files
@@ -232,7 +232,7 @@ def _new(options: argparse.Namespace) -> None:
 
 def _build(options: argparse.Namespace) -> None:
     from mpitled.deck import load_deck
-    from mpitled.solver.job import build, ensure_partition
+    from mpitled.job import build, ensure_partition
     from mpitled.store import describe_model
 
     deck = load_deck(options.deck, options.set)
@@ -243,7 +243,7 @@ def _build(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    from mpitled.speed import overview
+    from mpitled.preview import overview
 
     if options.file.suffix == ".toml":
         _mind_the_compiler()
@@ -279,13 +279,13 @@ def _export_images(run: Path, out: Path) -> None:
 
 
 def _model(path: Path) -> Path:
-    from mpitled.solver.job import MODEL
+    from mpitled.job import MODEL
 
     return path / MODEL if path.is_dir() else path
 
 
 def _partition(options: argparse.Namespace) -> None:
-    from mpitled.solver.job import divide
+    from mpitled.job import divide
 
     path = _model(options.model)
     if options.parts < 2:

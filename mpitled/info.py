@@ -219,7 +219,7 @@ def _asked(ask: Callable[[], str | None]) -> str | None:
 
 
 def _mpi() -> str:
-    from mpitled.solver.halo import library_version
+    from mpitled.parallel.halo import library_version
 
     return library_version()
 

@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import preprocess, store
+from mpitled import job, store
 from mpitled.batch import cases
 from mpitled.batch.summary import collect, records
 from mpitled.deck import Deck, load_deck
 from mpitled.errors import InputError
 from mpitled.model import Model
+from mpitled.model import build as model_build
+from mpitled.parallel.halo import World
 from mpitled.results import views
-from mpitled.solver import job
-from mpitled.solver.halo import World
 
 __all__ = ["Frames", "RunResult", "build_model", "load_deck", "open_result", "open_sweep", "run"]
 
@@ -36,7 +36,7 @@ def build_model(deck: Deck | str | Path, overrides: str | Sequence[str] = ()) ->
 
     Overrides, "section.key=value", are for a deck that is given as a path.
     """
-    return preprocess.build(_loaded(deck, overrides))
+    return model_build.build(_loaded(deck, overrides))
 
 
 def run(

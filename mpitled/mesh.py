@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import room
+from mpitled import resources
 from mpitled.errors import InputError
 from mpitled.material import Material
 
@@ -91,7 +91,7 @@ class Mesh:
 def check_size(n_hexahedra: float, key: str, remedy: str = "ask for fewer") -> None:
     """InputError if so many hexahedra, which a key of the deck asks for, are more than the machine has memory for."""
     what = f"{key}: makes {n_hexahedra:.3g} hexahedra, which"
-    room.check_memory(_HEXAHEDRON_BYTES * n_hexahedra, what, remedy)
+    resources.check_memory(_HEXAHEDRON_BYTES * n_hexahedra, what, remedy)
 
 
 def hexahedral_mesh(

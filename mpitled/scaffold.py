@@ -129,13 +129,14 @@ def _key(written: str, key: deck.Declared, value: Any) -> Iterator[str]:
 
 def _meshes(folder: Path) -> list[Path]:
     """The meshes of a small block with a cloud, where a user's own will be."""
-    from mpitled import export, preprocess, store
+    from mpitled import export, store
+    from mpitled.model import build as model_build
 
     with tempfile.TemporaryDirectory() as temporary:
         sample, model = Path(temporary) / "sample.toml", Path(temporary) / "model.h5"
         sample.write_text(_SAMPLE)
         scene = deck.load_deck(sample)
-        store.write_model(model, preprocess.build(scene), "", deck.canonical(scene))
+        store.write_model(model, model_build.build(scene), "", deck.canonical(scene))
         *meshes, _ = export.write_abaqus(model, Path(temporary) / "export")
         with atomic.writing(folder):
             folder.mkdir(parents=True, exist_ok=True)

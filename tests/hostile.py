@@ -255,7 +255,7 @@ _HEAD = '[labels]\nimage = "head.nii.gz"\nelement_size = 4.0\n[[fixed]]\nnodes =
 def readers(scratch: Path) -> dict[str, Reader]:
     """Every reader by name; `scratch` is a folder for what has to be computed first."""
     from mpitled.batch import cases, vary
-    from mpitled.speed import overview
+    from mpitled.preview import overview
 
     decks = {name: {file: text.encode() for file, text in files.items()} for name, files in KINDS.items()}
     void = {name: text.encode() for name, text in void_decks().items()}
@@ -299,10 +299,10 @@ def readers(scratch: Path) -> dict[str, Reader]:
 
 
 def _build(path: Path) -> object:
-    from mpitled import preprocess
     from mpitled.deck import load_deck
+    from mpitled.model import build as model_build
 
-    return preprocess.build(load_deck(path))
+    return model_build.build(load_deck(path))
 
 
 def _points(path: Path) -> object:
@@ -318,7 +318,7 @@ def _areas(path: Path) -> object:
 
 
 def _field(path: Path) -> object:
-    from mpitled.meshing.mapping import carry_over
+    from mpitled.model.mapping import carry_over
 
     return carry_over(path, 1.0, np.full((3, 3), 0.01), "nodes")
 
@@ -336,9 +336,9 @@ def _model(path: Path) -> object:
     """All that is read of a model, and the arrays that a rank makes of it, with each kernel called once."""
     from mpitled import info, store
     from mpitled.deck import Solver
-    from mpitled.solver.halo import World
-    from mpitled.solver.march import March
-    from mpitled.solver.subdomain import localise
+    from mpitled.parallel.halo import World
+    from mpitled.parallel.subdomain import localise
+    from mpitled.solver.central_difference import March
 
     info.contents(path)
     store.read_model(path)
@@ -376,10 +376,9 @@ def _result(path: Path) -> object:
 
 def _run(scratch: Path) -> tuple[Path, bytes, bytes, bytes]:
     """A small run's folder, its model (partitioned in two), its result, and a checkpoint."""
-    from mpitled import store
+    from mpitled import job, store
     from mpitled.deck import load_deck
-    from mpitled.solver import job
-    from mpitled.solver.halo import World
+    from mpitled.parallel.halo import World
 
     deck, folder = scratch / "run.toml", scratch / "run"
     deck.write_text(_SCENES["cloud"])

@@ -11,7 +11,7 @@ import numpy as np
 
 from mpitled import cli
 from mpitled.errors import UnstableError
-from mpitled.solver.halo import World
+from mpitled.parallel.halo import World
 from mpitled.solver.run import Run
 from mpitled.store import ResultWriter
 

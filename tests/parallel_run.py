@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from mpitled import job
 from mpitled.deck import load_deck
-from mpitled.solver import job
-from mpitled.solver.halo import World
+from mpitled.parallel.halo import World
 
 
 def main(deck: Path, directory: Path) -> None:

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from mpitled.deck import MeshFiles
 from mpitled.errors import InputError
 from mpitled.mesh import grid_points, structured_hexahedra
+from mpitled.preview import overview
 from mpitled.readers import meshes
 from mpitled.readers.meshfile import MeshFile, exterior_faces
-from mpitled.speed import overview
 
 
 def read(folder: Path, text: str | bytes, name: str = "deck.inp") -> MeshFile:

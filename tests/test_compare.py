@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from conftest import ROOT, complaint, mpitled
 
-from mpitled import deck, preprocess, store
+from mpitled import deck, store
 from mpitled.errors import InputError
+from mpitled.model import build as model_build
 from mpitled.results import compare, field
 
 DATA, VALIDATION = Path(__file__).with_name("data"), ROOT / "jobs" / "validation"
@@ -42,7 +43,7 @@ def synthetic(folder, text, displacement=affine):
     path = folder / "scene.toml"
     path.write_text(text)
     scene = deck.load_deck(path)
-    model = preprocess.build(scene)
+    model = model_build.build(scene)
     store.write_model(folder / "model.h5", model, deck.model_key(scene))
     tumour = scene.tumour and {"radius_m": float(np.cbrt(3 * scene.tumour.volume / (4 * np.pi)))}
     metadata = {"deck": deck.canonical(scene), "load_time_s": 2.0, "tumour": tumour}
@@ -87,10 +88,10 @@ def test_affine_field_is_reproduced_everywhere(runs, cloud):
 def test_places_are_found_in_distorted_hexahedra():
     """Forth through the trilinear map and back again; the cells are bent so that most do not hold their neighbour."""
     rng = np.random.default_rng(5)
-    model = preprocess.block.block_mesh(deck.Block(size=(0.06, 0.05, 0.04), elements=(6, 5, 4)), deck.Cloud(), None)
+    model = model_build.block.block_mesh(deck.Block(size=(0.06, 0.05, 0.04), elements=(6, 5, 4)), deck.Cloud(), None)
     points = model.points + 0.25 * 0.01 * rng.uniform(-1, 1, model.points.shape)
     cells, xi = rng.integers(0, len(model.hexahedra), 2000), rng.uniform(-0.999, 0.999, (2000, 3))
-    shapes = (1 + preprocess.hexahedra.CORNERS * xi[:, None]).prod(axis=2) / 8
+    shapes = (1 + model_build.hexahedra.CORNERS * xi[:, None]).prod(axis=2) / 8
     places = np.einsum("na,nai->ni", shapes, points[model.hexahedra[cells]])
     found, back, distance = field.locate(points, model.hexahedra, places)
     np.testing.assert_array_equal(found, cells)

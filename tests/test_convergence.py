@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 from conftest import ROOT, mpitled
 
-from mpitled import preprocess, store
+from mpitled import store
 from mpitled.deck import load_deck
+from mpitled.model import build as model_build
+from mpitled.parallel.halo import World
+from mpitled.parallel.subdomain import localise
 from mpitled.results import compare
-from mpitled.solver.halo import World
-from mpitled.solver.relaxation import Relaxation
-from mpitled.solver.subdomain import localise
+from mpitled.solver.dynamic_relaxation import Relaxation
 
 SIZE = 0.06  # m
 BLOCK = """
@@ -62,10 +63,10 @@ def error(folder, n, cloud, consistency="true"):
     path = folder / "scene.toml"
     path.write_text(BLOCK.format(n=n, cloud=cloud, consistency=consistency))
     deck = load_deck(path)
-    mesh = preprocess.read_mesh(deck)
+    mesh = model_build.read_mesh(deck)
     if cloud == "none":
         mesh = replace(mesh, points=distorted(mesh.points))
-    model = preprocess.discretise(deck, mesh)
+    model = model_build.discretise(deck, mesh)
     surface = model.prescribed_dofs[::3] // 3
     model = replace(model, prescribed_displacements=exact(model.points[surface]).ravel())
     store.write_model(folder / "model.h5", model, "")

@@ -12,9 +12,9 @@ from scenes import block, pulled
 
 from mpitled.deck import load_deck
 from mpitled.errors import InputError
-from mpitled.solver.halo import World
-from mpitled.solver.job import prepare, run
-from mpitled.speed.dry import left_out, reasons
+from mpitled.job import prepare, run
+from mpitled.parallel.halo import World
+from mpitled.preview.dry_run import left_out, reasons
 from mpitled.speed.witness import kernel_names
 from mpitled.store import open_result
 

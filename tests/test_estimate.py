@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mpitled import job
 from mpitled.batch.exact import shell
 from mpitled.deck import load_deck
-from mpitled.solver import job
-from mpitled.solver.halo import World
+from mpitled.parallel.halo import World
 from mpitled.store import open_result, read_model
 
 BRAIN = """

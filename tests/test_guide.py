@@ -12,7 +12,7 @@ from conftest import ENVIRONMENT, ROOT, mpitled
 from guide import GUIDE, PARTS, follow
 
 from mpitled.deck import load_deck
-from mpitled.speed import overview
+from mpitled.preview import overview
 
 
 def test_from_a_segmentation_to_a_table(segmentation):

@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_kernels import box
 
-from mpitled.mesh import CORNERS, grid_points, structured_hexahedra
-from mpitled.solver.hexahedra import (
+from mpitled.cells.hexahedra import (
     FLAT,
     HOURGLASS_MODES,
     aspect,
@@ -22,6 +21,7 @@ from mpitled.solver.hexahedra import (
     scaled_jacobian,
     volumes,
 )
+from mpitled.mesh import CORNERS, grid_points, structured_hexahedra
 
 CUBE = (CORNERS + 1) / 2
 ONE = np.arange(8)[None]

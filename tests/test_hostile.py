@@ -19,12 +19,12 @@ import pytest
 from conftest import ENVIRONMENT, ROOT, mpitled
 from hostile import attempt, readers
 
-from mpitled import room, store
+from mpitled import store
 from mpitled.batch import vary
 from mpitled.deck import load_deck
 from mpitled.errors import InputError
 from mpitled.meshing.labels import read_image
-from mpitled.preprocess import build
+from mpitled.model.build import build
 from mpitled.readers import abaqus, tables
 from mpitled.results import compare
 
@@ -122,7 +122,7 @@ def test_a_bomb_of_integration_points_is_asked_for_its_room(tmp_path, monkeypatc
     with h5py.File(path, "w") as file:
         for name in ("x", "y", "z", "volume"):
             file.create_dataset(name, data=np.zeros(1 << 20), chunks=(1 << 18,), compression="gzip")
-    monkeypatch.setattr(room, "memory", lambda: 16 << 20)
+    monkeypatch.setattr(resources, "memory", lambda: 16 << 20)
     refused(path, "its 1048576 points: would take 33.6 MB of memory", tables.read_grid)
 
 
@@ -161,7 +161,7 @@ def test_an_image_that_claims_too_much_is_refused(tmp_path, monkeypatch):
     refused(packed, "claims 3.28e[+]13 voxels", read_image)
     # A bomb: what it claims is there, a thousand times smaller.
     packed.write_bytes(gzip.compress(nifti(300, 300, 300) + bytes(27_000_000)))
-    monkeypatch.setattr(room, "memory", lambda: 1 << 28)
+    monkeypatch.setattr(resources, "memory", lambda: 1 << 28)
     refused(packed, "its 2.7e[+]07 voxels: would take 1.51 GB of memory, and 268 MB are free", read_image)
     before = bytearray(nifti(2, 2, 2))
     struct.pack_into("<f", before, 108, 2e9)
@@ -184,7 +184,7 @@ def test_arrays_of_others_run_nothing_and_take_no_room(tmp_path, monkeypatch):
             np.save(member, np.zeros((1 << 18, 3)))
             archive.writestr(f"{name}.npy", member.getvalue())
     assert path.stat().st_size < 1 << 17
-    monkeypatch.setattr(room, "memory", lambda: 1 << 24)
+    monkeypatch.setattr(resources, "memory", lambda: 1 << 24)
     refused(path, "its arrays: would take 50.3 MB of memory", lambda path: compare.read_reference(path, None))
 
 

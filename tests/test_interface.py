@@ -15,7 +15,7 @@ from conftest import ENVIRONMENT, ROOT, mpitled
 
 import mpitled as package
 from mpitled import store
-from mpitled.solver.stress import cauchy
+from mpitled.solver.cauchy_stress import cauchy
 
 CUBE = ROOT / "jobs" / "validation" / "cube.toml"
 

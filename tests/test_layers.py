@@ -14,9 +14,9 @@ from mpitled.batch.exact import layers
 from mpitled.errors import InputError
 from mpitled.mesh import grid_points, structured_hexahedra
 from mpitled.meshing.cloud import CLOSEST, fill_void, volumes_and_centroids
-from mpitled.preprocess import build, discretise, read_mesh
+from mpitled.model.build import build, discretise, read_mesh
+from mpitled.parallel.subdomain import localise
 from mpitled.results import field
-from mpitled.solver.subdomain import localise
 
 EPS = np.finfo(float).eps
 CONTRAST = 1000.0

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from mpitled import deck, preprocess
+from mpitled import deck
 from mpitled.errors import InputError
-from mpitled.meshing import mapping
 from mpitled.meshing.cloud import on_sphere
+from mpitled.model import build as model_build
+from mpitled.model import mapping
 
 SCENE = """
 [ellipsoid]
@@ -74,7 +75,7 @@ def test_field_in_the_deck(tmp_path):
     write(tmp_path / "field.csv", places / 10, smooth(places) / 10)
     path = tmp_path / "scene.toml"
     path.write_text(SCENE + 'field_unit = "cm"\ndirections = ["x", "z"]\n')
-    model = preprocess.build(deck.load_deck(path))
+    model = model_build.build(deck.load_deck(path))
     nodes, direction = model.prescribed_dofs // 3, model.prescribed_dofs % 3
     assert set(direction) == {0, 2}
     np.testing.assert_array_equal(np.unique(nodes), model.node_sets["surface"])
@@ -102,7 +103,7 @@ def test_what_is_wrong_with_a_field_is_said_in_a_line(tmp_path, change, message)
     np.savetxt(tmp_path / "field.csv", rows, "%.17g", ",", header="x,y,z,ux,uy,uz", comments="")
     (tmp_path / "scene.toml").write_text(SCENE)
     with pytest.raises(InputError, match=message) as caught:
-        preprocess.build(deck.load_deck(tmp_path / "scene.toml"))
+        model_build.build(deck.load_deck(tmp_path / "scene.toml"))
     assert "\n" not in str(caught.value)
 
 
@@ -118,7 +119,7 @@ def test_either_displacement_or_field(tmp_path):
 def test_the_bump_of_the_validation_is_known_exactly():
     """To 0.003 mm, of 10 mm, at the nodes of its deck: far less than any error of the solution."""
     scene = deck.load_deck(ROOT / "jobs" / "validation" / "bump.toml", ["ellipsoid.cloud=none"])
-    mesh = preprocess.read_mesh(scene)
+    mesh = model_build.read_mesh(scene)
     nodes = mesh.points[mesh.node_sets["surface"]]
     found = 1e3 * mapping.carry_over(scene.displaced[0].field, 1e-3, nodes, "here")
     x, y, z = 1e3 * nodes.T

@@ -17,14 +17,14 @@ from conftest import complaint, mpitled
 from decks import CLOUD, FLAT, void_decks
 
 from mpitled import export, store
+from mpitled.cells import hexahedra
 from mpitled.deck import MeshFiles, load_deck
 from mpitled.errors import InputError
 from mpitled.material import Material
 from mpitled.mesh import Mesh, grid_points, structured_hexahedra
-from mpitled.preprocess import build
+from mpitled.model.build import build
+from mpitled.preview import overview
 from mpitled.readers import meshes, tables
-from mpitled.solver import hexahedra
-from mpitled.speed import overview
 
 EPS = float(np.finfo(float).eps)
 GROWTH = """

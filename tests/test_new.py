@@ -10,11 +10,12 @@ import pytest
 from conftest import ROOT, complaint, mpitled
 from scenes import TUMOUR
 
-from mpitled import preprocess, scaffold
+from mpitled import scaffold
 from mpitled.arguments import KINDS
 from mpitled.deck import canonical, load_deck
 from mpitled.errors import InputError
-from mpitled.speed import overview
+from mpitled.model import build as model_build
+from mpitled.preview import overview
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -116,7 +117,7 @@ def test_a_wrong_deck_gets_a_message_to_act_on(tmp_path, mistake):
 
 def test_a_slip_of_the_unit_that_is_possible_is_a_warning(tmp_path):
     def said(old, new):
-        return "\n".join(preprocess.build(load_deck(wrong(tmp_path, old, new))).remarks)
+        return "\n".join(model_build.build(load_deck(wrong(tmp_path, old, new))).remarks)
 
     for old, new, word in (
         ("youngs_modulus = 3000.0", "youngs_modulus = 0.003", "material.brain.youngs_modulus = 0.003: is it in Pa?"),
@@ -174,7 +175,7 @@ def test_a_tissue_too_soft_for_a_tumour_is_warned_of_by_runs_too(tmp_path):
     said = "warning: material.brain.youngs_modulus = 3: is softer than any tissue that a tumour grows in; moduli are in"
     remarks = overview.figures(path, ["material.brain.youngs_modulus=3"])["remarks"]
     assert remarks == [f"{said} Pa"]
-    assert remarks == list(preprocess.build(load_deck(path, ["material.brain.youngs_modulus=3"])).remarks)  # of a run
+    assert remarks == list(model_build.build(load_deck(path, ["material.brain.youngs_modulus=3"])).remarks)  # of a run
     (remark,) = overview.figures(path, ["material.brain.youngs_modulus=0.003"])["remarks"]
     assert "youngs_modulus = 0.003" in remark
 

@@ -8,14 +8,17 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from mpitled import deck, loading, preprocess
+from mpitled import deck, kernels
+from mpitled.cells import hexahedra
+from mpitled.cells import support_domains as support
 from mpitled.errors import InputError
 from mpitled.mesh import Rotation
-from mpitled.meshing import onion
+from mpitled.meshing import o_grid as onion
 from mpitled.meshing.block import block_mesh
 from mpitled.meshing.cloud import boundary_faces
 from mpitled.meshing.phantoms import cylinder_mesh, ellipsoid_mesh
-from mpitled.solver import hexahedra, kernels, support
+from mpitled.model import build as model_build
+from mpitled.model import loading
 
 CLOUD = deck.Cloud()
 TUMOUR = deck.Tumour(centre=(0.015, 0.0, 0.008), volume=523.6e-9)
@@ -165,7 +168,7 @@ def test_sphere_of_cells(tmp_path):
     cyst = "[sphere.cyst]\ncentre = [12, 20, 20]\nradius = 10\n"
     cyst += '[material.fluid]\nyoungs_modulus = 10\npoissons_ratio = 0.1\ncells = ["cyst"]\n'
     path.write_text(text + cyst)
-    mesh, model = (of(deck.load_deck(path)) for of in (preprocess.read_mesh, preprocess.build))
+    mesh, model = (of(deck.load_deck(path)) for of in (model_build.read_mesh, model_build.build))
     places = np.concatenate([mesh.points[mesh.hexahedra].mean(axis=1), mesh.integration_points])
     middles = 0.005 * (np.floor(places / 0.005) + 0.5)
     inside = np.linalg.norm(middles - [0.012, 0.02, 0.02], axis=1) <= 0.01
@@ -174,7 +177,7 @@ def test_sphere_of_cells(tmp_path):
     np.testing.assert_array_equal([model.materials[m].name for m in model.material], np.where(inside, "fluid", "brain"))
     # A sphere of no other material divides nothing, and takes each integration point by itself.
     path.write_text(text + cyst.partition("[material")[0])
-    undivided = preprocess.read_mesh(deck.load_deck(path))
+    undivided = model_build.read_mesh(deck.load_deck(path))
     assert len(undivided.parts) == 1 < len(mesh.parts)
     places = np.concatenate([undivided.points[undivided.hexahedra].mean(axis=1), undivided.integration_points])
     inside = np.linalg.norm(places - [0.012, 0.02, 0.02], axis=1) <= 0.01
@@ -185,7 +188,7 @@ def test_sphere_of_cells(tmp_path):
     ):
         path.write_text(text + cyst.replace(before, after))
         with pytest.raises(InputError, match=message):
-            preprocess.read_mesh(deck.load_deck(path))
+            model_build.read_mesh(deck.load_deck(path))
     path.write_text(text + cyst)
     with pytest.raises(InputError, match=r"block.fitted = .*is none of the spheres \(cyst\)"):
         deck.load_deck(path, ["block.fitted=cist"])
@@ -229,7 +232,7 @@ def test_constant_stress_is_in_balance_at_inner_nodes(tmp_path, shape, cloud):
     }[shape]
     path = tmp_path / "scene.toml"
     path.write_text(f'{geometry}cloud = "{cloud}"\n{MATERIAL}[[fixed]]\nnodes = "surface"\n')
-    model = preprocess.build(deck.load_deck(path))
+    model = model_build.build(deck.load_deck(path))
     B, V = hexahedra.geometry(model.points, model.hexahedra)
     if cloud == "core":
         assert len(model.domains) > 0
@@ -301,7 +304,7 @@ def test_rotation_in_the_deck(tmp_path):
     text = "[block]\ncorner = [-10, -10, 0]\nsize = [20, 20, 40]\nelements = [2, 2, 4]\n" + MATERIAL
     text += '[[fixed]]\nnodes = "z0"\n[[displaced]]\nnodes = "z1"\ndisplacement = [0, 0, 4]\nrotation = 90\n'
     path.write_text(text)
-    model = preprocess.build(deck.load_deck(path))
+    model = model_build.build(deck.load_deck(path))
     top = model.node_sets["z1"]
     u = np.zeros(3 * model.n_nodes)
     u[model.prescribed_dofs] = model.prescribed_displacements

@@ -16,13 +16,13 @@ import pytest
 from conftest import ROOT, complaint, mpitled
 
 from mpitled import info, store
+from mpitled.cells import hexahedra
 from mpitled.deck import Cloud, load_deck
 from mpitled.mesh import grid_points, structured_hexahedra
 from mpitled.meshing.cloud import FACES, boundary_faces, fill_void, interface_faces
-from mpitled.preprocess import build
+from mpitled.model.build import build
 from mpitled.results import report
 from mpitled.results.solid import cut_tetrahedra, solid_of, triangles_of
-from mpitled.solver import hexahedra
 
 GROWTH = """
 title = "a tumour in a block"

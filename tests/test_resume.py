@@ -16,12 +16,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scenes import MIXED, pulled
 
-from mpitled import checksum, cli, store
+from mpitled import checksum, cli, job, store
 from mpitled import deck as decks
 from mpitled.deck import load_deck
 from mpitled.errors import InputError, InterruptedRun
-from mpitled.solver import job
-from mpitled.solver.halo import World
+from mpitled.parallel.halo import World
 from mpitled.solver.progress import Progress
 from mpitled.solver.run import Run
 

@@ -18,11 +18,10 @@ from conftest import ENVIRONMENT, ROOT, complaint, mpitled, ranks, script
 from scenes import MIXED, TUMOUR
 from scipy.optimize import brentq
 
-from mpitled import store
+from mpitled import job, store
 from mpitled.deck import load_deck
-from mpitled.loading import loading_curve
-from mpitled.solver import job
-from mpitled.solver.stress import cauchy
+from mpitled.model.loading import loading_curve
+from mpitled.solver.cauchy_stress import cauchy
 from mpitled.store import open_result
 
 SLIDING = "".join(f'[[fixed]]\nnodes = "{face}0"\ndirections = ["{face}"]\n' for face in "xyz")

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpitled import preprocess, store
+from mpitled import job, store
 from mpitled.deck import load_deck, model_key
-from mpitled.solver import job
-from mpitled.solver.halo import World
-from mpitled.solver.march import March
-from mpitled.solver.relaxation import Relaxation
-from mpitled.solver.subdomain import localise
+from mpitled.model import build as model_build
+from mpitled.parallel.halo import World
+from mpitled.parallel.subdomain import localise
+from mpitled.solver.central_difference import March
+from mpitled.solver.dynamic_relaxation import Relaxation
 
 TISSUE = """
 [material.tissue]
@@ -94,14 +94,14 @@ def subdomain(tmp_path, text, share):
     path = tmp_path / "scene.toml"
     path.write_text(text)
     deck = load_deck(path)
-    mesh = preprocess.read_mesh(deck)
+    mesh = model_build.read_mesh(deck)
     if share:
         inner = np.setdiff1d(np.arange(mesh.n_nodes), mesh.node_sets["surface"])
         shifts = np.random.default_rng(1).uniform(-share, share, (len(inner), 3))
         points = mesh.points.copy()
         points[inner] += shifts * np.ptp(points, axis=0) / 6
         mesh = replace(mesh, points=points)
-    model = preprocess.discretise(deck, mesh)
+    model = model_build.discretise(deck, mesh)
     store.write_model(tmp_path / "model.h5", model, model_key(deck))
     rows = store.read_part(tmp_path / "model.h5", 1, 0)
     sub = localise(rows, deck.hexahedra.hourglass, deck.support.stabilisation, deck.hexahedra.gradient)

@@ -13,12 +13,12 @@ from conftest import ROOT, complaint, mpitled
 
 from mpitled.batch import extremes, stability
 from mpitled.batch.exact import shell
+from mpitled.cells import hexahedra
 from mpitled.deck import MeshFiles
 from mpitled.material import Material
 from mpitled.model import Model
 from mpitled.readers import meshes
 from mpitled.results import charts
-from mpitled.solver import hexahedra
 
 FEW = extremes.AXES["few"]
 

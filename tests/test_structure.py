@@ -20,7 +20,7 @@ MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob
 #: Libraries that one module (or the modules of one package) alone may import, at its head or inside of a function.
 OWNERS = {
     "h5py": "mpitled.store",
-    "mpi4py": "mpitled.solver.halo",
+    "mpi4py": "mpitled.parallel.halo",
     "pymetis": "partition.metis",
     "pyvista": "mpitled.results.views",
     "xarray": "mpitled.interface",

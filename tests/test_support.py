@@ -7,13 +7,8 @@ import pytest
 from scipy.spatial import cKDTree
 from test_kernels import HOURGLASS, at, forces, part
 
-from mpitled.deck import load_deck
-from mpitled.errors import InputError
-from mpitled.mesh import CORNERS
-from mpitled.preprocess import build
-from mpitled.solver import hexahedra
-from mpitled.solver.subdomain import localise
-from mpitled.solver.support import (
+from mpitled.cells import hexahedra
+from mpitled.cells.support_domains import (
     FLATTEST,
     POWERS,
     field_at_nodes,
@@ -24,6 +19,11 @@ from mpitled.solver.support import (
     repair,
     worst_condition,
 )
+from mpitled.deck import load_deck
+from mpitled.errors import InputError
+from mpitled.mesh import CORNERS
+from mpitled.model.build import build
+from mpitled.parallel.subdomain import localise
 
 EPS = np.finfo(float).eps
 AFFINE = np.array([[0.2, 0.05, 0.0], [0.0, -0.09, 0.03], [0.02, 0.0, -0.09]])

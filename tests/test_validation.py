@@ -12,12 +12,13 @@ from scipy.linalg import eigh
 from scipy.optimize import brentq
 from test_compare import CYLINDER, DATA, SLOPE, synthetic
 
-from mpitled import preprocess, store
+from mpitled import store
 from mpitled.deck import load_deck
 from mpitled.material import first_piola
+from mpitled.model import build as model_build
+from mpitled.parallel.subdomain import localise
 from mpitled.results import charts, compare, field
 from mpitled.solver.step import at_rest, compose_forces
-from mpitled.solver.subdomain import localise
 
 CUBE = ROOT / "jobs" / "validation" / "cube.toml"
 #: What the deck of the cube has other than the program's defaults.
@@ -82,7 +83,7 @@ def slowest(folder, stretch, *keys):
     w M v = K v, K by central differences of the program's own forces.
     """
     deck = load_deck(CUBE, keys)
-    model = preprocess.build(deck)
+    model = model_build.build(deck)
     store.write_model(folder / "model.h5", model, "")
     sub = localise(
         store.read_part(folder / "model.h5", 1, 0), deck.hexahedra.hourglass, deck.support.stabilisation, "mean"

@@ -32,13 +32,13 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mpitled import preprocess
+from mpitled import job
 from mpitled.deck import Deck, load_deck
-from mpitled.loading import sphere_radius
 from mpitled.mesh import CORNERS, Mesh
+from mpitled.model import build as model_build
+from mpitled.model.loading import sphere_radius
+from mpitled.parallel.halo import World
 from mpitled.results import compare, field
-from mpitled.solver import job
-from mpitled.solver.halo import World
 
 ROOT = Path(__file__).resolve().parents[2]
 OUT = Path("out/implicit")
@@ -181,7 +181,7 @@ def _one(name: str, family: str, *mesh: str) -> None:
     if deck.tumour:
         radii = np.array(json.loads(str(data["meta"]))["R"])
         exact = exact[np.abs(radii - sphere_radius(deck.tumour.volume)).argmin()]
-    edge = compare.edge_distance(preprocess.build(deck), data["X"])
+    edge = compare.edge_distance(model_build.build(deck), data["X"])
     chosen = (edge > scene.beyond) & ~np.isin(data["tag"], (2, 3))  # prescribed places say nothing
     error = 1e3 * np.linalg.norm(u - exact, axis=1)[chosen]
     figures |= {"max_error_mm": error.max(), "rms_error_mm": np.sqrt((error**2).mean())}
@@ -228,19 +228,19 @@ def _implicit(
     import felupe
 
     begin = time.perf_counter()
-    linear = preprocess.read_mesh(deck)
+    linear = model_build.read_mesh(deck)
     material = deck.materials[0].material
     shear = felupe.NeoHookeCompressible(mu=material.mu)
     mesh = felupe.Mesh(linear.points, linear.hexahedra, "hexahedron")
     if order == 1:
-        dofs, full, _ = preprocess.prescribe(deck, linear)
+        dofs, full, _ = model_build.prescribe(deck, linear)
         region = felupe.RegionHexahedron(mesh)
         fields = felupe.FieldContainer([felupe.Field(region, dim=3)])
         body = felupe.SolidBodyNearlyIncompressible(shear, fields, bulk=material.lam)
     else:
         mesh, sets = _quadratic(deck, linear, mesh)
         numbers = np.arange(len(mesh.points))
-        dofs, full, _ = preprocess.prescribe(
+        dofs, full, _ = model_build.prescribe(
             deck, replace(linear, points=mesh.points, node_ids=numbers, node_sets=sets)
         )
         region = felupe.RegionTriQuadraticHexahedron(mesh)

@@ -24,10 +24,10 @@ import numpy as np
 
 from mpitled.batch import launch
 from mpitled.deck import load_deck
+from mpitled.preview import forecast
 from mpitled.results import field
-from mpitled.solver.relaxation import Relaxation
+from mpitled.solver.dynamic_relaxation import Relaxation
 from mpitled.solver.step import take
-from mpitled.speed import forecast
 
 HERE = Path(__file__).parent
 STUDIES = HERE.parent / "studies"

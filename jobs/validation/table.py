@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled.batch import launch
+from mpitled.cells import hexahedra
 from mpitled.meshing.cloud import on_sphere
 from mpitled.results import charts, compare, field
-from mpitled.solver import hexahedra
 
 HERE = Path(__file__).parent
 REFERENCES, STUDIES = HERE.parents[1] / "tests" / "data", HERE.parent / "studies"

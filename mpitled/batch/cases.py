@@ -15,8 +15,8 @@ from mpitled import deck as decks
 from mpitled.batch import launch, manifest, vary
 from mpitled.deck import Deck
 from mpitled.errors import InputError
-from mpitled.loading import sphere_radius
-from mpitled.solver.job import included
+from mpitled.job import included
+from mpitled.model.loading import sphere_radius
 
 MANIFEST = "sweep.json"
 #: Frames of a run that passes through the volumes of a sweep; between them results are interpolated.

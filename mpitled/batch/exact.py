@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
 
-from mpitled.loading import sphere_radius
 from mpitled.material import Material, first_piola
 from mpitled.model import Model
+from mpitled.model.loading import sphere_radius
 
 
 def stretched(model: Model, places: NDArray[np.float64], _: float) -> NDArray[np.float64]:

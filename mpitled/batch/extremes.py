@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mpitled.cells import hexahedra
 from mpitled.mesh import grid_points, structured_hexahedra
-from mpitled.solver import hexahedra
 
 _MATERIAL = """
 [material.brain]

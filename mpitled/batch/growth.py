@@ -15,7 +15,7 @@ from mpitled import deck as decks
 from mpitled.batch import launch
 from mpitled.batch.cases import Case, Sweep
 from mpitled.errors import InputError
-from mpitled.loading import loading_curve, sphere_radius
+from mpitled.model.loading import loading_curve, sphere_radius
 from mpitled.results import report
 from mpitled.results.report import Outcome
 

@@ -10,7 +10,7 @@ from typing import Any
 from mpitled import atomic
 from mpitled.batch import launch
 from mpitled.errors import InputError
-from mpitled.solver.job import MODEL
+from mpitled.job import MODEL
 
 
 def claim(path: Path, manifest: Mapping[str, Any]) -> None:

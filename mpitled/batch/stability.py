@@ -28,10 +28,10 @@ from mpitled import atomic, store
 from mpitled.batch import launch
 from mpitled.batch.exact import CLOSED_FORMS
 from mpitled.batch.extremes import AXES, KINDS, METHODS, Axis, write_grid
+from mpitled.cells import hexahedra
 from mpitled.errors import InputError, MpitledError
 from mpitled.material import strain_energy
 from mpitled.model import Model
-from mpitled.solver import hexahedra
 
 #: Warned: the field is not that of the reference, but the mesh was warned of when it was read, or the result when it
 #: was there. Buckled: it is not that of a closed form which the mesh has exactly, but it holds less energy: the closed

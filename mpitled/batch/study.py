@@ -14,8 +14,8 @@ from mpitled.batch import launch, manifest
 from mpitled.batch import vary as families
 from mpitled.deck import Deck, load_deck, scene_key
 from mpitled.errors import InputError
+from mpitled.job import included
 from mpitled.results import compare
-from mpitled.solver.job import included
 
 MANIFEST = "study.json"
 

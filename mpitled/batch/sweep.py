@@ -15,14 +15,14 @@ from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdo
 from pathlib import Path
 from typing import NoReturn
 
-from mpitled import atomic, lock, store
+from mpitled import atomic, job, lock, store
 from mpitled import deck as decks
 from mpitled.batch import launch
 from mpitled.batch.cases import MANIFEST, Case, Sweep, is_sweep
 from mpitled.batch.screen import Screen, share_done
 from mpitled.errors import InputError, InterruptedRun, MpitledError, everywhere
-from mpitled.solver import checkpoint, job
-from mpitled.solver.halo import World
+from mpitled.parallel.halo import World
+from mpitled.solver import checkpoint
 
 _WATCH = 0.2  # s between looks at what is at work
 #: Folders of programs that are found anyway, and must not come before those of modules.

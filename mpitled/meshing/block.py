@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mpitled.errors import InputError
 from mpitled.mesh import Mesh, check_size, grid_points, hexahedral_mesh, structured_hexahedra
 from mpitled.meshing.cloud import in_millimetres, with_cloud
-from mpitled.meshing.onion import Onion, number
+from mpitled.meshing.o_grid import Onion, number
 
 if TYPE_CHECKING:
     from mpitled import deck

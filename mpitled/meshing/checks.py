@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mpitled.solver import hexahedra
+from mpitled.cells import hexahedra
 
 #: Orders in which programs number a hexahedron's nodes that are not Abaqus's: top and bottom exchanged (or mirrored),
 #: along x, then y, then z, and that one mirrored. Nodes in such an order are taken in the order given here.

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mpitled import room
+from mpitled import resources
+from mpitled.cells.hexahedra import geometry, nodal_sum
 from mpitled.errors import InputError
 from mpitled.mesh import CORNERS, Mesh, Part, numbered_mesh
-from mpitled.solver.hexahedra import geometry, nodal_sum
 
 if TYPE_CHECKING:
     from mpitled import deck
@@ -387,7 +387,7 @@ def _seed(cloud: deck.Cloud, tumour: deck.Tumour | None, element_size: float) ->
     # One node per squared spacing; the surface is never coarser than the cloud next to it would be.
     coarsest = min(cloud.growth * radius, largest)
     wanted = max(tumour.surface_nodes, np.ceil(4 * np.pi * (radius / coarsest) ** 2) if coarsest else np.inf)
-    room.check_memory(
+    resources.check_memory(
         _BYTES * wanted, f"cloud.growth, tumour.surface_nodes: ask for {wanted:.3g} nodes on the seed, which", _COARSER
     )
     n = int(wanted)
@@ -411,7 +411,7 @@ def _check_size(corners: NDArray[np.float64], void: float, spacing: Spacing, per
     cuts = _edges(corners) * max(per_spacing, 1.0) / spacing(corners.mean(axis=1))[:, None]
     needed = max(nodes * (1 + per_spacing**3), float(np.maximum(cuts, 1).prod(axis=1).sum()))
     what = f"cloud: makes about {needed:.3g} nodes and integration points, which"
-    room.check_memory(_BYTES * needed, what, f"{_COARSER} by spacing, growth or points_per_spacing")
+    resources.check_memory(_BYTES * needed, what, f"{_COARSER} by spacing, growth or points_per_spacing")
 
 
 def _ball(radius: float) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from mpitled import room
+from mpitled import resources
 from mpitled.errors import InputError
 from mpitled.mesh import CORNERS, Mesh, Part, check_size
 from mpitled.meshing.cloud import fill_void, in_millimetres, length, looks_like_metres
@@ -287,7 +287,7 @@ def _check_claim(path: Path, image: Any) -> None:
     packed = path.suffix.lower() in (".gz", ".mgz")
     if n * kind.itemsize > path.stat().st_size * (_INFLATED if packed else 1):
         raise InputError(f"{path}: claims {n:.3g} voxels and has {path.stat().st_size} bytes; write it anew")
-    room.check_memory(
+    resources.check_memory(
         n * (2 * max(kind.itemsize, 8) + _VOXEL_BYTES), f"{path}: its {n:.3g} voxels", "cut it to the head"
     )
 
@@ -359,7 +359,7 @@ def _grid(image: Image, body: Cells, size: float) -> Grid:
     wanted = np.ceil((high - low) / size - 1e-9) + 4
     overlaps = (wanted * image.labels.shape[::-1]).sum()  # see box_shares
     what = f"labels.element_size = {1e3 * size:g} mm: a grid of {wanted.prod():.3g} cubes"
-    room.check_memory(_CUBE_BYTES * (wanted.prod() + overlaps), what, "enlarge it")
+    resources.check_memory(_CUBE_BYTES * (wanted.prod() + overlaps), what, "enlarge it")
     n = wanted.astype(int)
     return Grid((low + high) / 2 - size * n / 2, size, (int(n[0]), int(n[1]), int(n[2])))
 

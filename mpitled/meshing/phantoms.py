@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mpitled.errors import InputError
 from mpitled.mesh import Mesh, check_size, hexahedral_mesh
 from mpitled.meshing.cloud import in_millimetres, with_cloud
-from mpitled.meshing.onion import Onion, graded, number, on_sphere
+from mpitled.meshing.o_grid import Onion, graded, number, on_sphere
 
 if TYPE_CHECKING:
     from mpitled import deck

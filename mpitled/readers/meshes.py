@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpitled import store
+from mpitled.cells import hexahedra
 from mpitled.errors import InputError
 from mpitled.material import Material
 from mpitled.mesh import METRES, Constraint, Mesh
@@ -26,7 +27,6 @@ from mpitled.meshing import checks
 from mpitled.meshing.cloud import subdivide, volumes_and_centroids
 from mpitled.readers import abaqus, lsdyna, meshfile, tables
 from mpitled.readers.meshfile import Cells, MeshFile
-from mpitled.solver import hexahedra
 
 if TYPE_CHECKING:
     from mpitled import deck

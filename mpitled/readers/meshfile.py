@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import room
+from mpitled import resources
 from mpitled.errors import InputError
 from mpitled.mesh import Constraint
 
@@ -167,7 +167,7 @@ def read_text(path: Path, what: str) -> bytes:
     try:
         check_file(path, what)
         # A text's numbers, nodes, cells and sets take more than the text itself.
-        room.check_memory(4 * path.stat().st_size, f"{path}: to read it", "use a machine with more")
+        resources.check_memory(4 * path.stat().st_size, f"{path}: to read it", "use a machine with more")
         text = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}; give the path of {what}") from None

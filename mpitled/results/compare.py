@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mpitled import deck, room, store
+from mpitled import deck, resources, store
+from mpitled.cells import hexahedra
 from mpitled.errors import InputError, damaged
 from mpitled.model import Model
-from mpitled.preprocess import OUTER
+from mpitled.model.build import OUTER
 from mpitled.readers import meshfile
 from mpitled.readers.meshfile import FARTHEST
 from mpitled.results import field
 from mpitled.results.field import Field
-from mpitled.solver import hexahedra
 
 #: What the tags of a reference mean; fixed and moved places are prescribed, so that they say nothing of the solution.
 TAGS = ("interior", "free surface", "fixed", "moved", "material interface")
@@ -222,7 +222,7 @@ def _of_npz(path: Path, ours: Field) -> Reference:
         with zipfile.ZipFile(path) as archive:
             # What is packed may be a thousand times what is in the file.
             size = sum(member.file_size for member in archive.infolist() if member.filename[:-4] in names)
-        room.check_memory(4 * size, f"{path}: its arrays", "give fewer places")
+        resources.check_memory(4 * size, f"{path}: its arrays", "give fewer places")
         with np.load(path, allow_pickle=False) as arrays:
             data = {name: np.asarray(arrays[name]) for name in names if name in arrays}
         meta = dict(json.loads(str(data.pop("meta", "{}"))))

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpitled import store
+from mpitled.cells.support_domains import moving_least_squares
 from mpitled.errors import InputError, damaged
 from mpitled.mesh import CORNERS
 from mpitled.meshing.cloud import boundary_faces
 from mpitled.model import Model
-from mpitled.solver.support import moving_least_squares
 
 #: Where a value came from: inside a hexahedron, a support domain, or the hexahedron next to a place outside the mesh.
 IN_HEXAHEDRON, IN_CLOUD, OUTSIDE = 0, 1, 2

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from mpitled import atomic, deck, room
+from mpitled import atomic, deck, resources
 from mpitled.errors import InputError, damaged
 from mpitled.meshing.labels import VENTRICLES, Cells, Image, parts_of, read_image
 from mpitled.results.field import Field, open_field
@@ -76,7 +76,7 @@ def write_nifti(run: Path, directory: Path) -> Written:
     field = open_field(run)
     image, body, ventricles = _image_of(field, run)
     needed = _VOXEL_BYTES * body.size + _BODY_BYTES * float(body.sum())
-    room.check_memory(needed, f"{image.path}: its {body.size:.3g} voxels", "cut it to the head")
+    resources.check_memory(needed, f"{image.path}: its {body.size:.3g} voxels", "cut it to the head")
     seed, tumour = _balls(field)
     atomic.make_folder(directory)
     paths = [directory / name for name in (DISPLACEMENT, INVERSE, LABELS)]

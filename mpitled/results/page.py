@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled import atomic, store, toml
+from mpitled.cells import hexahedra
 from mpitled.deck import GEOMETRIES, unit_of
+from mpitled.job import PAGE
+from mpitled.preview import dry_run as dry
 from mpitled.results import markup, report
 from mpitled.results.report import LARGE, Outcome
 from mpitled.results.solid import Solid
-from mpitled.solver import hexahedra
-from mpitled.solver.job import PAGE
-from mpitled.speed import dry
 
 _NO_MATPLOTLIB = "There are no pictures here, for matplotlib is missing: pip install 'mpitled[pictures]'."
 

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled import atomic, store
+from mpitled.cells import hexahedra
 from mpitled.errors import InputError, damaged
 from mpitled.meshing.cloud import boundary_faces, interface_faces
 from mpitled.model import Model
 from mpitled.results.solid import Solid, solid_of
-from mpitled.solver import hexahedra
 
 REPORT, MODEL = "report.json", "model.h5"
 #: Displacements beyond this are large (paper, 6.2), m.

@@ -12,9 +12,9 @@ from mpitled import __version__, store
 from mpitled import deck as decks
 from mpitled.deck import Deck
 from mpitled.errors import InputError
-from mpitled.solver.halo import World
-from mpitled.solver.memory import Memory, Packed, Parts, pack, unpack
-from mpitled.solver.subdomain import Subdomain
+from mpitled.parallel.halo import World
+from mpitled.parallel.subdomain import Subdomain
+from mpitled.solver.restart import Memory, Packed, Parts, pack, unpack
 
 
 class Found(NamedTuple):

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from mpitled.errors import InterruptedRun
-from mpitled.solver.halo import World
+from mpitled.parallel.halo import World
 
 #: What ends a run in order. mpirun ends its ranks itself, within a second, when it gets one of the first two; the third
 #: it passes on.

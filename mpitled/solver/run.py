@@ -16,20 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled import deck as decks
-from mpitled import room, store
+from mpitled import resources, store
 from mpitled.deck import Deck
 from mpitled.errors import InputError, InterruptedRun, MpitledError, UnstableError, everywhere
-from mpitled.loading import sphere_radius
+from mpitled.model.loading import sphere_radius
+from mpitled.parallel.halo import Halo, World
+from mpitled.parallel.subdomain import Subdomain
 from mpitled.solver import checkpoint
-from mpitled.solver.halo import Halo, World
-from mpitled.solver.march import March
-from mpitled.solver.memory import Kept, Memory, Parts, recall, remember
+from mpitled.solver.cauchy_stress import cauchy
+from mpitled.solver.central_difference import March
+from mpitled.solver.dynamic_relaxation import Relaxation
+from mpitled.solver.monitor import BALANCE_LIMIT, Watch
 from mpitled.solver.progress import Interrupts, Phases, Progress
-from mpitled.solver.relaxation import Relaxation
+from mpitled.solver.restart import Kept, Memory, Parts, recall, remember
 from mpitled.solver.step import State, Term
-from mpitled.solver.stress import cauchy
-from mpitled.solver.subdomain import Subdomain
-from mpitled.solver.watch import BALANCE_LIMIT, Watch
 
 #: Looks from one state that recovery can go back to until the next; how often a run may go back; and which time a
 #: relaxation begins its load anew, for what it went back to was spoilt if the load still fails.
@@ -118,7 +118,7 @@ class Run:
     def _check_disc(self) -> None:
         what = f"the result of {self.deck.output.frames + 1} frames"
         needed = self.output_bytes - store.unfinished_bytes(self.directory)
-        room.check_disc(needed, self.directory, what, "lower output.frames, or give another folder")
+        resources.check_disc(needed, self.directory, what, "lower output.frames, or give another folder")
 
     def run(self, interrupts: Interrupts) -> dict[str, float]:
         """To the end, with a result that is whole; the seconds of each phase on this rank. Collective."""

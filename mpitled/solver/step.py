@@ -9,11 +9,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled.loading import loading_curve
-from mpitled.solver import kernels
-from mpitled.solver.halo import Halo
-from mpitled.solver.memory import Kept
-from mpitled.solver.subdomain import Subdomain
+from mpitled import kernels
+from mpitled.model.loading import loading_curve
+from mpitled.parallel.halo import Halo
+from mpitled.parallel.subdomain import Subdomain
+from mpitled.solver.restart import Kept
 
 
 @dataclass(slots=True)

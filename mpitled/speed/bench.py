@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from mpitled import preprocess, store
+from mpitled import job, store
 from mpitled.batch import launch
 from mpitled.deck import Deck, Support, load_deck
 from mpitled.errors import InputError
-from mpitled.solver import job
-from mpitled.solver.halo import World
+from mpitled.model import build as model_build
+from mpitled.parallel.halo import World
 from mpitled.speed import flops
 
 #: A case is slower than it was below this share of its speed. Medians of two runs on a quiet machine differ by 5 %.
@@ -244,7 +244,7 @@ def scene(folder: Path, kind: str, size: Any, nodes: int = DOMAIN_NODES) -> dict
     folder.mkdir()
     deck = _deck(folder, kind, size, nodes)
     model = folder / job.MODEL
-    mesh = preprocess.read_mesh(deck)
+    mesh = model_build.read_mesh(deck)
     if kind == "distorted":
         assert deck.block is not None
         inner = np.setdiff1d(np.arange(mesh.n_nodes), mesh.node_sets["surface"])
@@ -252,7 +252,7 @@ def scene(folder: Path, kind: str, size: Any, nodes: int = DOMAIN_NODES) -> dict
         edge = np.array(deck.block.size) / deck.block.elements
         points[inner] += np.random.default_rng(0).uniform(-_DISTORTION, _DISTORTION, (len(inner), 3)) * edge
         mesh = replace(mesh, points=points)
-    store.write_model(model, preprocess.discretise(deck, mesh), "bench")
+    store.write_model(model, model_build.discretise(deck, mesh), "bench")
     return {
         "scene": kind,
         "size": size,

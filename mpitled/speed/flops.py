@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from mpitled import store
-from mpitled.solver.kernels import BATCH_LANES
+from mpitled.kernels import BATCH_LANES
+from mpitled.parallel.subdomain import localise
 from mpitled.solver.step import at_rest, compose_forces, compose_march
-from mpitled.solver.subdomain import localise
 
 #: R_hg of the paper: any that is not 0.
 HOURGLASS = 0.04 / 9

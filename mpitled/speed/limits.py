@@ -9,7 +9,7 @@ from numba import njit
 from numba import uint64 as U
 from numpy.typing import DTypeLike
 
-from mpitled.solver.kernels.lanes import load, store, width
+from mpitled.kernels.lanes import load, store, width
 
 #: Bytes of the triad that is told as the machine's: beyond what a core has of caches.
 LARGE = 3 << 27

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from mpitled import store
-from mpitled.solver.halo import World
-from mpitled.solver.subdomain import localise
+from mpitled.parallel.halo import World
+from mpitled.parallel.subdomain import localise
 from mpitled.speed import bench
 from mpitled.speed.pace import QUICK_REPEATS, QUICK_SPAN, REPEATS, SPAN, Pace, made, timed
 from mpitled.store import PartRows

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from mpitled import store
-from mpitled.solver.halo import Halo, World
-from mpitled.solver.relaxation import Relaxation
+from mpitled.parallel.halo import Halo, World
+from mpitled.parallel.subdomain import Subdomain, localise
+from mpitled.solver.dynamic_relaxation import Relaxation
 from mpitled.solver.step import State, Term, at_rest, compose_forces, compose_march, compose_relaxation
-from mpitled.solver.subdomain import Subdomain, localise
 from mpitled.speed import limits
 from mpitled.speed.witness import Call, distinct_bytes, witness
 

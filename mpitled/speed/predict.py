@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import partition
 from mpitled import atomic, store
 from mpitled.errors import InputError
-from mpitled.solver.subdomain import DOMAIN_NODE_COST, cell_costs
+from mpitled.parallel.subdomain import DOMAIN_NODE_COST, cell_costs
 
 COLUMNS = (
     "parts", "cells_mean", "cells_largest", "balance", "halo_nodes_mean", "halo_nodes_largest", "neighbours_mean",

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mpitled.solver import job
+from mpitled import job
 from mpitled.speed import bench
 
 #: Scenes of strong scaling, and the elements along each edge of the block that each rank has in weak scaling.

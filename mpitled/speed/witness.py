@@ -13,7 +13,7 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
-from mpitled.solver import kernels
+from mpitled import kernels
 
 
 @dataclass(frozen=True, slots=True)

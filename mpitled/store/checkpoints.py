@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import checksum, vet
+from mpitled import checksum, hdf5_validation
 from mpitled.errors import InputError, damaged
 from mpitled.store.files import (
     AGAIN,
@@ -93,14 +93,14 @@ def write_checkpoint(
 def is_checkpoint(path: Path) -> bool:
     """Whether the HDF5 file is a checkpoint, of whatever layout; InputError if it is no HDF5 file."""
     with open_file(path) as file, damaged(path, AGAIN):
-        vet.check_file(file, path, numbers=True)
+        hdf5_validation.check_file(file, path, numbers=True)
         return "told" in file and "node" in file
 
 
 def checkpoint_contents(path: Path) -> dict[str, Any]:
     """What a checkpoint tells. Reads all of it; InputError if it is none of this layout, or not what was written."""
     with open_file(path) as file, damaged(path, AGAIN):
-        vet.check_file(file, path, numbers=True)
+        hdf5_validation.check_file(file, path, numbers=True)
         layout = attribute(file, "layout") if "told" in file and "node" in file else None
         if layout == CHECKPOINT_LAYOUT and (broken := first_broken(file)) is None:
             return dict(read_json(file, "told"))
@@ -119,7 +119,7 @@ def read_checkpoint(
     Of a file that `checkpoint_contents` has read.
     """
     with open_file(path) as file, damaged(path, AGAIN):
-        vet.check_file(file, path, numbers=True)
+        hdf5_validation.check_file(file, path, numbers=True)
         found, rows = matching(file["node"], nodes, 1)
         order = np.argsort(found)
         if not np.array_equal(found[order], nodes):

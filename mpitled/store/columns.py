@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import room, vet
+from mpitled import hdf5_validation, resources
 from mpitled.errors import InputError, damaged
 from mpitled.store.files import open_file, replacing
 
@@ -29,7 +29,7 @@ def write_columns(path: Path, groups: Mapping[str, Mapping[str, Sequence[float |
 def table_contents(path: Path) -> dict[str, dict[str, Any]]:
     """Columns and number of rows of each table, by name; empty if the HDF5 file is not of tables alone."""
     with open_file(path) as file, damaged(path, "make it anew"):
-        vet.check_file(file, path)
+        hdf5_validation.check_file(file, path)
         tables = {}
         for name, group in file.items():
             columns = dict(group) if isinstance(group, h5py.Group) else {}
@@ -48,13 +48,13 @@ def read_grid(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         names = ("x", "y", "z", "volume")
         if missing := [name for name in names if name not in file]:
             raise InputError(f"{path}: has no dataset '{missing[0]}'; give x, y, z and volume")
-        given = [vet.member(file, name, path) for name in names]
+        given = [hdf5_validation.member(file, name, path) for name in names]
         kinds = {item.dtype.kind if isinstance(item, h5py.Dataset) else "" for item in given}
         if not kinds <= set("fiu") or {len(item.shape or ()) for item in given} != {1} or len({*map(len, given)}) > 1:
             raise InputError(f"{path}: x, y, z and volume are not four lists of as many numbers; correct them")
         for item in given:
-            vet.check_dataset(item, path)
+            hdf5_validation.check_dataset(item, path)
         # Packed data may be a thousand times what is in the file.
-        room.check_memory(32 * len(given[0]), f"{path}: its {len(given[0])} points", "give fewer")
+        resources.check_memory(32 * len(given[0]), f"{path}: its {len(given[0])} points", "give fewer")
         columns = [item[...].astype(np.float64) for item in given]
     return np.stack(columns[:3], axis=1), columns[3]

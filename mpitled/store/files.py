@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import checksum, room, vet
+from mpitled import checksum, hdf5_validation, resources
 from mpitled.errors import InputError, damaged
 
 #: Bytes that are read over rather than skipped: about what one more call of HDF5 costs (70 us at 3.5 GB/s).
@@ -37,7 +37,7 @@ def has_mpi() -> bool:
 def check_hdf5(path: Path) -> None:
     """InputError if another library that is about to read a file would be led out of it, or told to take too much."""
     with open_file(path) as file, damaged(path, "write it anew"):
-        vet.check_file(file, path)
+        hdf5_validation.check_file(file, path)
 
 
 def open_file(path: Path) -> h5py.File:
@@ -90,7 +90,7 @@ def writing(path: Path) -> Iterator[None]:
 def check_room(path: Path, size: int) -> None:
     """InputError if the disc has no room for so many bytes, some of HDF5's own added: HDF5 takes a full disc badly."""
     path = Path(path)
-    room.check_disc(size + size // 50 + (1 << 16), path.parent, path.name, "make room, or give another folder")
+    resources.check_disc(size + size // 50 + (1 << 16), path.parent, path.name, "make room, or give another folder")
 
 
 def reserve(path: Path) -> None:

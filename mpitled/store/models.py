@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import vet
+from mpitled import hdf5_validation
 from mpitled.errors import InputError, damaged
 from mpitled.material import Material
 from mpitled.model import Model
@@ -226,7 +226,7 @@ def open_model(path: Path) -> Iterator[h5py.File]:
             raise InputError(f"{path}: is not a model of mpitled; build the model from its deck")
         if (layout := attribute(file, "layout")) != MODEL_LAYOUT:
             raise InputError(f"{path}: has layout {layout}, this version reads {MODEL_LAYOUT}; {REBUILD}")
-        vet.check_file(file, path, numbers=True)
+        hdf5_validation.check_file(file, path, numbers=True)
         _check_shapes(file)
         yield file
 

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import checksum, vet
+from mpitled import checksum, hdf5_validation
 from mpitled.errors import InputError, damaged
 from mpitled.store.files import AGAIN, attribute, checksum_of, first_broken, matching, open_file, read_json, read_rows
 
@@ -207,7 +207,7 @@ def is_finished(directory: Path) -> bool:
 def is_result(path: Path) -> bool:
     """Whether the HDF5 file is a result of ours, of whatever layout; InputError if it is no HDF5 file."""
     with open_file(path) as file, damaged(path, "give another file"):
-        vet.check_file(file, path)
+        hdf5_validation.check_file(file, path)
         return "mpitled" in file and "VTKHDF" in file
 
 
@@ -225,7 +225,7 @@ def open_result(path: Path) -> Result:
     file = open_file(path)
     try:
         with damaged(path, AGAIN):
-            vet.check_file(file, path, numbers=True)
+            hdf5_validation.check_file(file, path, numbers=True)
             layout = attribute(file["mpitled"], "layout") if "mpitled" in file and "VTKHDF" in file else None
             if layout == RESULT_LAYOUT:
                 return Result(file, path)

@@ -10,14 +10,14 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from mpitled import room, store
+from mpitled import resources, store
 from mpitled.deck import Deck
 from mpitled.model import Model
-from mpitled.solver.halo import World
-from mpitled.solver.march import March
-from mpitled.solver.relaxation import Relaxation
+from mpitled.parallel.halo import World
+from mpitled.parallel.subdomain import PRECISIONS, Subdomain, localise
+from mpitled.solver.central_difference import March
+from mpitled.solver.dynamic_relaxation import Relaxation
 from mpitled.solver.run import cell_data
-from mpitled.solver.subdomain import PRECISIONS, Subdomain, localise
 
 #: Times that each term is called to tell how long it takes; the fastest counts, for others may use the machine too.
 CALLS = 9
@@ -41,7 +41,7 @@ class Forecast(NamedTuple):
         """In a line."""
         least = "at least " if self.at_least else ""
         steps = f"{least}{self.steps} steps of {1e3 * self.step_s:.2g} ms, so {least}{self.loop_s:.2g} s of stepping"
-        return f"{steps}, on one rank here; {room.told(self.output_bytes)} of results"
+        return f"{steps}, on one rank here; {resources.told(self.output_bytes)} of results"
 
 
 def measure(method: March | Relaxation) -> tuple[dict[str, float], float]:

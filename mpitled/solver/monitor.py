@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled.errors import UnstableError
-from mpitled.solver.halo import World
-from mpitled.solver.march import March
-from mpitled.solver.memory import Kept
-from mpitled.solver.relaxation import Relaxation
-from mpitled.solver.subdomain import Subdomain
+from mpitled.parallel.halo import World
+from mpitled.parallel.subdomain import Subdomain
+from mpitled.solver.central_difference import March
+from mpitled.solver.dynamic_relaxation import Relaxation
+from mpitled.solver.restart import Kept
 
 #: The energy balance may be wrong by this share of the largest energy; beyond it the run is unstable.
 BALANCE_LIMIT = 0.05

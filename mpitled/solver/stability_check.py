@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled.solver import kernels
+from mpitled import kernels
+from mpitled.parallel.subdomain import Subdomain
 from mpitled.solver.step import State
-from mpitled.solver.subdomain import Subdomain
 
 
 @dataclass(slots=True)

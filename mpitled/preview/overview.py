@@ -10,16 +10,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import preprocess
 from mpitled.deck import Deck, MeshFiles, Tumour, load_deck
 from mpitled.errors import InputError
-from mpitled.loading import sphere_radius
 from mpitled.mesh import Constraint, Mesh
 from mpitled.meshing import checks, labels
 from mpitled.meshing.cloud import in_millimetres, length
+from mpitled.model import build as model_build
+from mpitled.model.loading import sphere_radius
+from mpitled.preview import forecast
 from mpitled.readers import meshes
 from mpitled.readers.meshfile import MeshFile
-from mpitled.speed import forecast
 
 #: A tumour this near to the plane between left and right is in the middle, m.
 _MIDDLE = 0.5e-3
@@ -64,8 +64,8 @@ def _items(path: Path, overrides: Sequence[str]) -> Iterator[Item]:
 
 
 def _deck(deck: Deck) -> Iterator[Item]:
-    mesh = preprocess.read_mesh(deck)
-    model = preprocess.discretise(deck, mesh)
+    mesh = model_build.read_mesh(deck)
+    model = model_build.discretise(deck, mesh)
     efg = mesh.n_nodes - mesh.n_fe_nodes
     yield Item(
         "nodes",
@@ -87,7 +87,7 @@ def _deck(deck: Deck) -> Iterator[Item]:
         yield Item("material", text, {material.name: asdict(material) | {"cells": n}})
     yield from _constraints((*deck.constraints(), *mesh.constraints), mesh.node_sets, 1e3, " mm")
     if deck.tumour:
-        n = len(mesh.node_sets[preprocess.TUMOUR])
+        n = len(mesh.node_sets[model_build.TUMOUR])
         yield Item("grows", f"tumour ({n} nodes)", {"tumour": n})
         yield _tumour(deck.tumour, mesh, x_is_right=deck.labels is not None)
     n, of = len(model.prescribed_dofs), 3 * model.n_nodes
@@ -104,8 +104,8 @@ def _tumour(tumour: Tumour, mesh: Mesh, *, x_is_right: bool) -> Item:
     for name in labels.VENTRICLES:
         cells = mesh.cell_sets.get(name, np.empty(0, np.int64))
         around[name] = mesh.points[np.unique(mesh.hexahedra[cells[cells < len(mesh.hexahedra)]])]
-    for name in preprocess.OUTER:
-        outer = np.setdiff1d(mesh.node_sets.get(name, ()), mesh.node_sets[preprocess.TUMOUR])
+    for name in model_build.OUTER:
+        outer = np.setdiff1d(mesh.node_sets.get(name, ()), mesh.node_sets[model_build.TUMOUR])
         around[name] = mesh.points[outer.astype(np.int64)]
     around = {name: points for name, points in around.items() if len(points)}
     apart = {name: float(np.linalg.norm(points - centre, axis=1).min()) for name, points in around.items()}
@@ -118,7 +118,7 @@ def _tumour(tumour: Tumour, mesh: Mesh, *, x_is_right: bool) -> Item:
     elif not x_is_right:  # nobody knows
         across = 0.0
     side = "" if abs(across) < _MIDDLE else "right" if across > 0 else "left"
-    told = [*ventricles[:1], *(name for name in preprocess.OUTER if name in apart)]
+    told = [*ventricles[:1], *(name for name in model_build.OUTER if name in apart)]
     text = f"{in_millimetres(centre)}{side and f', {side} of the middle'}"
     grown = tumour.volume - 4 / 3 * np.pi * tumour.seed_radius**3
     text += f"; {1e9 * tumour.volume:.10g} mm3, {1e9 * grown:.5g} of it grown, radius {1e3 * tumour.seed_radius:g} -> "
@@ -171,7 +171,7 @@ def _file_checks(file: MeshFile) -> Iterator[str]:
         section = MeshFiles(fe=file.path)
         mesh = meshes.assemble(section, file, None)
         deck = Deck(mesh=section, path=file.path)
-        dofs = preprocess.prescribe(deck, mesh)[0].dofs if mesh.constraints else np.empty(0, np.int64)
+        dofs = model_build.prescribe(deck, mesh)[0].dofs if mesh.constraints else np.empty(0, np.int64)
         yield from mesh.remarks
         none = np.empty((0, 8), np.int64)
         said = checks.scene_remarks(mesh.points, mesh.hexahedra, none, mesh.n_fe_nodes, dofs)

@@ -14,11 +14,11 @@ from mpitled import deck as decks
 from mpitled.deck import Deck
 from mpitled.errors import InputError, MpitledError, UnstableError, everywhere
 from mpitled.model import WARNING
+from mpitled.parallel.halo import World
+from mpitled.parallel.subdomain import PRECISIONS, cell_costs, localise
 from mpitled.solver import checkpoint
-from mpitled.solver.halo import World
 from mpitled.solver.progress import Interrupts, Phases
 from mpitled.solver.run import Run
-from mpitled.solver.subdomain import PRECISIONS, cell_costs, localise
 
 MODEL, PAGE = "model.h5", "report.html"
 #: Said of a run that is at its end.
@@ -36,11 +36,11 @@ def build(deck: Deck, directory: Path, quiet: bool = True) -> tuple[Path, bool]:
         except InputError as error:
             print(f"note: {error}; it is built anew", file=sys.stderr, flush=True)
     atomic.make_folder(directory)
-    from mpitled import preprocess  # only the rank that builds needs the meshers
+    from mpitled.model import build as model_build  # only the rank that builds needs the meshers
 
     if not quiet:
         print("note: building the model", file=sys.stderr, flush=True)
-    store.write_model(path, preprocess.build(deck), key, decks.canonical(deck))
+    store.write_model(path, model_build.build(deck), key, decks.canonical(deck))
     return path, True
 
 

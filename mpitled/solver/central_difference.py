@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mpitled import kernels
 from mpitled.deck import Solver
 from mpitled.errors import InputError
-from mpitled.solver import kernels
-from mpitled.solver.halo import Halo, World
-from mpitled.solver.memory import Kept
-from mpitled.solver.sharpness import Sharpness
+from mpitled.parallel.halo import Halo, World
+from mpitled.parallel.subdomain import Subdomain
+from mpitled.solver.restart import Kept
+from mpitled.solver.spectral_radius import Sharpness
+from mpitled.solver.stability_check import Survey
 from mpitled.solver.step import State, at_rest, compose_forces, compose_march, rehearse, take
-from mpitled.solver.subdomain import Subdomain
-from mpitled.solver.survey import Survey
 
 #: Surveys of a run where what is stable changes fast, and where it does not; and the most steps from one to the next. A
 #: survey takes about the time of one step and a half.

@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 
 from mpitled import deck as decks
-from mpitled import room
+from mpitled import job, resources
 from mpitled.deck import Deck
 from mpitled.errors import everywhere
-from mpitled.solver import job
-from mpitled.solver.halo import World
-from mpitled.solver.march import March
-from mpitled.solver.subdomain import SHORTEST_RUN, Subdomain
-from mpitled.speed import forecast
+from mpitled.parallel.halo import World
+from mpitled.parallel.subdomain import SHORTEST_RUN, Subdomain
+from mpitled.preview import forecast
+from mpitled.solver.central_difference import March
 from mpitled.speed.witness import Call, distinct_bytes, witness
 
 
@@ -237,5 +236,5 @@ def _forecast(run: Any, step: float, survey: float) -> list[str]:
         f"steps: {expected.steps}{length}, {expected.surveys} surveys{more}",
         f"loop: {least}{expected.loop_s:.3g} s on the slowest rank ({1e3 * step:.3g} ms a step, "
         f"{1e3 * survey:.3g} ms a survey: the fastest of {forecast.CALLS} calls on this machine)",
-        f"output: {room.told(run.output_bytes)} in {run.deck.output.frames + 1} frames",
+        f"output: {resources.told(run.output_bytes)} in {run.deck.output.frames + 1} frames",
     ]

@@ -11,10 +11,10 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mpitled import room
+from mpitled import resources
+from mpitled.cells.hexahedra import nodal_sum
+from mpitled.cells.preconditioner import AffineGrid, solve
 from mpitled.errors import InputError
-from mpitled.solver.coarse import AffineGrid, solve
-from mpitled.solver.hexahedra import nodal_sum
 
 #: Exponents of x, y, z: complete bases of 4, 10 and 20 monomials. The paper's 7 and 11 add cross terms only.
 POWERS = np.array([(i, j, d - i - j) for d in range(4) for i in range(d, -1, -1) for j in range(d - i, -1, -1)])
@@ -60,7 +60,7 @@ def find_domains(
     if len(at) and n > len(points):
         raise InputError(f"support.nodes = {n}: is more than the {len(points)} nodes that there are; lower it")
     # Numbers, values and gradients of each node of each domain, and as much again while they are found.
-    room.check_memory(80.0 * len(at) * n, f"support.nodes = {n}: in each of {len(at)} domains", "lower it")
+    resources.check_memory(80.0 * len(at) * n, f"support.nodes = {n}: in each of {len(at)} domains", "lower it")
     domains = np.empty((len(at), n), np.int64)
     limited = 0
     tree = cKDTree(points)

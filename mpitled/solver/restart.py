@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled.solver.subdomain import Subdomain
+from mpitled.parallel.subdomain import Subdomain
 
 
 @dataclass(frozen=True, slots=True)

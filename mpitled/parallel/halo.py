@@ -11,8 +11,8 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from mpitled import kernels
 from mpitled.errors import MpitledError, everywhere
-from mpitled.solver import kernels
 
 #: What launchers tell each process of the number of ranks (OpenMPI, MPICH and Intel MPI, PMIx under SLURM).
 _SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS" if "PMIX_RANK" in os.environ else "PMI_SIZE")

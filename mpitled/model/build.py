@@ -9,16 +9,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mpitled.cells import hexahedra
+from mpitled.cells import support_domains as support
 from mpitled.deck import Deck, Sphere
 from mpitled.errors import InputError
-from mpitled.loading import growth, sphere_radius, turn
 from mpitled.material import Material
 from mpitled.mesh import Constraint, Mesh, Part, named_set
 from mpitled.meshing import block, checks, labels, phantoms
 from mpitled.meshing.cloud import in_millimetres, in_sphere, length, looks_like_metres
-from mpitled.meshing.mapping import carry_over
 from mpitled.model import Model
-from mpitled.solver import hexahedra, support
+from mpitled.model.loading import growth, sphere_radius, turn
+from mpitled.model.mapping import carry_over
 
 #: The node set of a seed's surface, which the meshers make where there is a tumour.
 TUMOUR = "tumour"

@@ -30,10 +30,10 @@ def _cached_by_source() -> Iterator[None]:
 
 
 with _cached_by_source():
-    from mpitled.solver.kernels.domains import domain_forces, domain_survey
-    from mpitled.solver.kernels.hexahedra import hexahedron_forces, hexahedron_survey, voxel_forces, voxel_survey
-    from mpitled.solver.kernels.lanes import BATCH as BATCH_LANES
-    from mpitled.solver.kernels.nodes import (
+    from mpitled.kernels.domains import domain_forces, domain_survey
+    from mpitled.kernels.hexahedra import hexahedron_forces, hexahedron_survey, voxel_forces, voxel_survey
+    from mpitled.kernels.lanes import BATCH as BATCH_LANES
+    from mpitled.kernels.nodes import (
         add,
         add_gathered,
         change_step,

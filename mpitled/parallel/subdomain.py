@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mpitled.cells import hexahedra
+from mpitled.cells import support_domains as support
+from mpitled.kernels import BATCH_LANES
+from mpitled.kernels.lanes import BITS
 from mpitled.material import hourglass_modulus
 from mpitled.mesh import CORNERS
-from mpitled.solver import hexahedra, support
-from mpitled.solver.kernels import BATCH_LANES
-from mpitled.solver.kernels.lanes import BITS
 from mpitled.store import BLOCK, PartRows
 
 #: Boxes in a row shorter than this are gathered: a run keeps a whole vector of lanes busy.

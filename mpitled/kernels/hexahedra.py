@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import uint64 as U
 
-from mpitled.solver.kernels.lanes import (
+from mpitled.kernels.lanes import (
     BATCH,
     first_of,
     gather,
@@ -20,7 +20,7 @@ from mpitled.solver.kernels.lanes import (
     store,
     width,
 )  # fmt: skip
-from mpitled.solver.kernels.stress import batch_survey, energy_and_bound, first_piola, inline, kernel
+from mpitled.kernels.stress import batch_survey, energy_and_bound, first_piola, inline, kernel
 
 _BATCH = np.uint64(BATCH)
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from numba import njit
 
-from mpitled.solver.kernels.lanes import FAST, first_of, load, magnitude, root, store
+from mpitled.kernels.lanes import FAST, first_of, load, magnitude, root, store
 
 #: Decorators of what kernels call, and of kernels.
 inline: Any = njit(fastmath=FAST, error_model="numpy", cache=True, forceinline=True)

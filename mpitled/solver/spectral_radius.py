@@ -15,11 +15,11 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled.solver import kernels
-from mpitled.solver.halo import World
-from mpitled.solver.memory import Kept
+from mpitled import kernels
+from mpitled.parallel.halo import World
+from mpitled.parallel.subdomain import Subdomain
+from mpitled.solver.restart import Kept
 from mpitled.solver.step import State, Term, take
-from mpitled.solver.subdomain import Subdomain
 
 #: Most quotients at first, and later; and the growth of Rayleigh's quotient in one at which they end. It grows towards
 #: the eigenvalue: what is missing is left to `solver.safety`, 0.64 of the eigenvalue. Each time they begin at random:

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numba import uint64 as U
 
-from mpitled.solver.kernels.stress import cofactor, inline, kernel
+from mpitled.kernels.stress import cofactor, inline, kernel
 
 
 @njit(cache=True)

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from mpitled.cells import hexahedra
 from mpitled.material import first_piola
-from mpitled.solver import hexahedra
 from mpitled.store import PartRows
 
 #: Rows and columns of the components as VTK has them: xx, yy, zz, xy, yz, xz.

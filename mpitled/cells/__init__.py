@@ -1,0 +1,1 @@
+"""The kinds of cell: geometry, gradients, stabilisation and masses of each, in one file each."""

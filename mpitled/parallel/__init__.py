@@ -1,0 +1,1 @@
+"""Ranks: the part of the model on each, and what they exchange."""
