@@ -19,7 +19,7 @@ import pytest
 from conftest import ENVIRONMENT, ROOT, mpitled
 from hostile import attempt, readers
 
-from mpitled import store
+from mpitled import resources, store
 from mpitled.batch import vary
 from mpitled.deck import load_deck
 from mpitled.errors import InputError
