@@ -18,7 +18,7 @@ from types import UnionType
 from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 from mpitled.errors import InputError
-from mpitled.material import Material
+from mpitled.laws import Material, NeoHookean
 from mpitled.mesh import METRES, Constraint, Rotation
 
 if sys.version_info >= (3, 11):
@@ -224,7 +224,8 @@ class MaterialSection:
 
     @property
     def material(self) -> Material:
-        return Material(self.name, self.youngs_modulus, self.poissons_ratio, self.density)
+        law = NeoHookean(youngs_modulus=self.youngs_modulus, poissons_ratio=self.poissons_ratio)
+        return Material(self.name, law, self.density)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
