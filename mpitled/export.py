@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from mpitled import store, toml
 from mpitled.deck import GEOMETRIES
 from mpitled.errors import InputError
+from mpitled.laws import Material, NeoHookean
 from mpitled.model import Model
 from mpitled.readers.meshfile import LARGEST_ID
 
@@ -136,9 +137,17 @@ def _fe(model: Model, ids: NDArray[np.int64]) -> Iterator[str]:
             if len(model.cell_sets[name]) and model.cell_sets[name][0] < n_cells:
                 yield f"*SOLID SECTION, ELSET={_quoted(name)}, MATERIAL={_quoted(material.name)}\n"
         yield f"*MATERIAL, NAME={_quoted(material.name)}\n*DENSITY\n{material.density!r}\n"
-        bulk = material.youngs_modulus / (3 * (1 - 2 * material.poissons_ratio))
-        yield f"{_LAW}*HYPERELASTIC, NEO HOOKE\n{material.mu / 2!r}, {2 / bulk!r}\n"
+        yield _abaqus_law(material)
     yield from _boundary(model, ids, 0, n)
+
+
+def _abaqus_law(material: Material) -> str:
+    """The material's law as Abaqus has it. InputError for a law that it does not have."""
+    law = material.law
+    if not isinstance(law, NeoHookean):
+        raise InputError(f"material.{material.name}: Abaqus decks hold neo-hookean materials, not {law.name}")
+    bulk = law.youngs_modulus / (3 * (1 - 2 * law.poissons_ratio))
+    return f"{_LAW}*HYPERELASTIC, NEO HOOKE\n{law.mu / 2!r}, {2 / bulk!r}\n"
 
 
 def _efg(model: Model, ids: NDArray[np.int64]) -> Iterator[str]:
@@ -275,5 +284,5 @@ def _scene(model: Model, scene: dict[str, Any], files: Sequence[str]) -> Iterato
         sets = _sets_of(np.flatnonzero(model.material == i), model.cell_sets)
         if sets:
             yield f"\n[material.{toml.value(name)}]\n"
-            yield f"youngs_modulus = {material.youngs_modulus!r}\npoissons_ratio = {material.poissons_ratio!r}\n"
-            yield f"density = {material.density!r}\ncells = {toml.value(sets)}\n"
+            keys = material.record() | {"cells": sets}
+            yield from (f"{key} = {toml.value(value)}\n" for key, value in keys.items() if key not in ("name", "law"))

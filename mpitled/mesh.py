@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mpitled import resources
 from mpitled.errors import InputError
-from mpitled.material import Material
+from mpitled.laws import Material
 
 #: Units of length of decks and files, in m.
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}

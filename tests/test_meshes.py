@@ -20,7 +20,7 @@ from mpitled import export, store
 from mpitled.cells import hexahedra
 from mpitled.deck import MeshFiles, load_deck
 from mpitled.errors import InputError
-from mpitled.material import Material
+from mpitled.laws import Material, NeoHookean
 from mpitled.mesh import Mesh, grid_points, structured_hexahedra
 from mpitled.model.build import build
 from mpitled.preview import overview
@@ -409,15 +409,18 @@ def test_exported_materials_are_read_as_what_they_were(void):
     model = build(load_deck(void / "scene.toml"))
     rng, n = np.random.default_rng(0), model.n_cells
     laws = zip(10 ** rng.uniform(-3, 12, n), rng.uniform(-0.99, 0.4999, n), strict=True)
-    given = [Material(f"m{i}", float(E), float(nu), 1000.0) for i, (E, nu) in enumerate(laws)]
+    given = [
+        Material(f"m{i}", NeoHookean(youngs_modulus=float(E), poissons_ratio=float(nu)), 1000.0)
+        for i, (E, nu) in enumerate(laws)
+    ]
     model = replace(model, materials=tuple(given), material=np.arange(n, dtype=np.int16))
     store.write_model(void / "model.h5", model, "key", {})
     export.write_abaqus(void / "model.h5", void / "decks")
     file = meshes.read_file(void / "decks" / "fe.inp")
     assert len(file.materials) == len(model.hexahedra)
     for (_, found), material in zip(file.materials, given, strict=False):
-        assert found.youngs_modulus == pytest.approx(material.youngs_modulus, rel=5 * EPS)
-        assert found.poissons_ratio == pytest.approx(material.poissons_ratio, rel=0, abs=3 * EPS)
+        assert found.youngs_modulus == pytest.approx(material.law.youngs_modulus, rel=5 * EPS)
+        assert found.poissons_ratio == pytest.approx(material.law.poissons_ratio, rel=0, abs=3 * EPS)
     assert "*ELASTIC" not in (void / "decks" / "fe.inp").read_text()
 
 

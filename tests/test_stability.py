@@ -15,7 +15,7 @@ from mpitled.batch import extremes, stability
 from mpitled.batch.exact import shell
 from mpitled.cells import hexahedra
 from mpitled.deck import MeshFiles
-from mpitled.material import Material
+from mpitled.laws import Material, NeoHookean
 from mpitled.model import Model
 from mpitled.readers import meshes
 from mpitled.results import charts
@@ -26,7 +26,10 @@ FEW = extremes.AXES["few"]
 def test_the_shell_is_that_of_an_independent_integration():
     """Places on a line, as nodes of a model that has nothing else; R up to five times the seed's."""
     with np.load(ROOT / "tests" / "data" / "C_shell_ode.npz") as data:
-        rho, material = data["rho"], Material("tissue", float(data["E"]), float(data["nu"]), 1000.0)
+        rho, material = (
+            data["rho"],
+            Material("tissue", NeoHookean(youngs_modulus=float(data["E"]), poissons_ratio=float(data["nu"])), 1000.0),
+        )
         for R, u in zip(data["R"], data["u"], strict=True):
             fields = dict.fromkeys(field.name for field in dataclasses.fields(Model))
             points = np.outer(rho, [0.6, 0.0, 0.8])

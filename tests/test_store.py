@@ -18,7 +18,7 @@ from parallel_store import N_FRAMES, frame, write
 import partition
 from mpitled import store
 from mpitled.errors import InputError
-from mpitled.material import Material
+from mpitled.laws import Material, NeoHookean
 from mpitled.mesh import grid_points, structured_hexahedra
 from mpitled.model import Model
 from mpitled.store import files
@@ -49,7 +49,10 @@ def small_model(seed: int = 0) -> Model:
         field_domains=rng.integers(n_domains, size=n_efg),
         field_shapes=rng.random((n_efg, n)),
         material=rng.integers(2, size=len(hexahedra) + n_domains).astype(np.int16),
-        materials=(Material("brain", 3000.0, 0.49, 1000.0), Material("cerebrospinal fluid", 10.0, 0.1, 1000.0)),
+        materials=(
+            Material("brain", NeoHookean(youngs_modulus=3000.0, poissons_ratio=0.49), 1000.0),
+            Material("cerebrospinal fluid", NeoHookean(youngs_modulus=10.0, poissons_ratio=0.1), 1000.0),
+        ),
         mass=rng.random(n_fe + n_efg),
         prescribed_dofs=dofs,
         prescribed_displacements=rng.random(len(dofs)),

@@ -14,7 +14,7 @@ from test_compare import CYLINDER, DATA, SLOPE, synthetic
 
 from mpitled import store
 from mpitled.deck import load_deck
-from mpitled.material import first_piola
+from mpitled.laws import first_piola
 from mpitled.model import build as model_build
 from mpitled.parallel.subdomain import localise
 from mpitled.results import charts, compare, field
@@ -89,9 +89,7 @@ def slowest(folder, stretch, *keys):
         store.read_part(folder / "model.h5", 1, 0), deck.hexahedra.hourglass, deck.support.stabilisation, "mean"
     )
     material = model.materials[0]
-    width = brentq(
-        lambda t: first_piola(np.diag([t, t, stretch]), material.lam, material.mu)[0, 0], 1, stretch**-0.5 + 0.1
-    )
+    width = brentq(lambda t: first_piola(material.law, np.diag([t, t, stretch]))[0, 0], 1, stretch**-0.5 + 0.1)
     state, terms = at_rest(sub, 1.0, 1e-4), compose_forces(sub, None)
     n, free = sub.n_nodes, np.flatnonzero(sub.free().T)
     state.u[:, :n] = (model.points * (np.array([width, width, stretch]) - 1)).T

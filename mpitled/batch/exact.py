@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
 
-from mpitled.material import Material, first_piola
+from mpitled.laws import Material, first_piola
 from mpitled.model import Model
 from mpitled.model.loading import sphere_radius
 
@@ -96,7 +96,7 @@ def _stretch(model: Model) -> float:
 
 
 def _stress(material: Material, *stretches: float) -> NDArray[np.float64]:
-    return np.diagonal(first_piola(np.diag(stretches), material.lam, material.mu))
+    return np.diagonal(first_piola(material.law, np.diag(stretches)))
 
 
 #: By name: displacements (n, 3), m, of a model at places (n, 3), m; the last argument is the tumour's volume, m^3.

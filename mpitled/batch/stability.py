@@ -30,7 +30,7 @@ from mpitled.batch.exact import CLOSED_FORMS
 from mpitled.batch.extremes import AXES, KINDS, METHODS, Axis, write_grid
 from mpitled.cells import hexahedra
 from mpitled.errors import InputError, MpitledError
-from mpitled.material import strain_energy
+from mpitled.laws import strain_energy
 from mpitled.model import Model
 
 #: Warned: the field is not that of the reference, but the mesh was warned of when it was read, or the result when it
@@ -236,7 +236,7 @@ def _energy(model: Model, displacement: NDArray[np.float64]) -> float:
     energy = 0.0
     for i, material in enumerate(model.materials):
         own = model.material == i
-        energy += float((strain_energy(X[own], material.lam, material.mu) * volumes[own]).sum())
+        energy += float((strain_energy(material.law, X[own]) * volumes[own]).sum())
     return energy
 
 

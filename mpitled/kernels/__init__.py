@@ -6,32 +6,9 @@ in SI units, and run in the precision of the arrays that they are given. Constan
 would be promoted.
 """
 
-import hashlib
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
+from mpitled.kernels.templates import cached_by_source
 
-from numba.core import config
-
-
-@contextmanager
-def _cached_by_source() -> Iterator[None]:
-    """Cached apart for each state of this package: numba itself sees no change in a module that a kernel imports."""
-    settings: Any = config
-    digest, before, here = hashlib.sha256(), settings.CACHE_DIR, Path(__file__).parent
-    for path in sorted(here.glob("*.py")):
-        digest.update(path.read_bytes())
-    settings.CACHE_DIR = str(Path(before or here / "__pycache__") / f"mpitled-{digest.hexdigest()[:16]}")
-    try:
-        yield
-    finally:
-        settings.CACHE_DIR = before
-
-
-with _cached_by_source():
-    from mpitled.kernels.domains import domain_forces, domain_survey
-    from mpitled.kernels.hexahedra import hexahedron_forces, hexahedron_survey, voxel_forces, voxel_survey
+with cached_by_source():
     from mpitled.kernels.lanes import BATCH as BATCH_LANES
     from mpitled.kernels.nodes import (
         add,
@@ -56,8 +33,7 @@ with _cached_by_source():
 PADDING = BATCH_LANES  # the last vector of a run reads beyond the run's nodes, and adds nothing there
 
 __all__ = [
-    "BATCH_LANES", "PADDING", "add", "add_gathered", "change_step", "domain_forces", "domain_survey", "follow",
-    "gather", "hexahedron_forces", "hexahedron_survey", "invert_masses", "keep_masses", "kinetic_energy", "perturb",
-    "raise_mass", "react", "relax", "respond", "scatter", "scramble", "update", "voxel_forces", "voxel_survey",
-    "watch_relaxation",
+    "BATCH_LANES", "PADDING", "add", "add_gathered", "change_step", "follow",
+    "gather", "invert_masses", "keep_masses", "kinetic_energy", "perturb",
+    "raise_mass", "react", "relax", "respond", "scatter", "scramble", "update", "watch_relaxation",
 ]  # fmt: skip

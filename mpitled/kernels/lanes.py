@@ -51,7 +51,7 @@ def width(row):  # type: ignore[no-untyped-def]
     return np.uint64(8 if row.dtype == object else BITS // 8 // row.dtype.itemsize)
 
 
-def spread(number, row):  # type: ignore[no-untyped-def]
+def broadcast(number, row):  # type: ignore[no-untyped-def]
     """The same number, of the type of those in `row`, in all lanes."""
     return np.full(width(row), number, row.dtype)
 
@@ -81,7 +81,7 @@ def prefetch(batch):  # type: ignore[no-untyped-def]
     """Ask for an array of two dimensions before it is needed."""
 
 
-def first_of(n, lanes, others):  # type: ignore[no-untyped-def]
+def select_first(n, lanes, others):  # type: ignore[no-untyped-def]
     """The first n of the lanes, and the others behind them."""
     return np.where(np.arange(len(lanes)) < n, lanes, others)
 
@@ -96,8 +96,8 @@ def last(lanes):  # type: ignore[no-untyped-def]
     return lanes[-1]
 
 
-def smaller(a, b):  # type: ignore[no-untyped-def]
-    """The smaller of two numbers in each lane; the first where either is no number."""
+def minimum(a, b):  # type: ignore[no-untyped-def]
+    """The minimum of two numbers in each lane; the first where either is no number."""
     return np.where(b < a, b, a)
 
 
@@ -106,14 +106,18 @@ def smallest(lanes):  # type: ignore[no-untyped-def]
     return lanes.min()
 
 
-def magnitude(lanes):  # type: ignore[no-untyped-def]
-    """Absolute values."""
-    return abs(lanes)
+def load_each(rows, count, first):  # type: ignore[no-untyped-def]
+    """`load` of each of the first `count` rows (count, :), as a tuple; `count` is a constant."""
+    return tuple(load(rows[i], first) for i in range(count))
 
 
-def root(lanes):  # type: ignore[no-untyped-def]
-    """Square roots."""
-    return np.sqrt(lanes)
+def broadcast_each(columns, count, column, n, row):  # type: ignore[no-untyped-def]
+    """The first `count` numbers of a column of (count, :), each in the first n lanes with 0 in the others, as a tuple.
+
+    `count` is a constant.
+    """
+    zeros = broadcast(row.dtype.type(0), row)
+    return tuple(select_first(n, broadcast(columns[i, column], row), zeros) for i in range(count))
 
 
 # ---------------------------------------------------------------- and what they become
@@ -141,22 +145,24 @@ def _in_lanes(builder: Any, number: Any, lanes: Any) -> Any:
 
 
 def _arithmetic(function: Any, instruction: str) -> None:
-    """An operator on two vectors, or on one and a number of the same type."""
+    """An operator on two vectors, or on one and a number, which takes the type of the vector's numbers."""
 
     def result(a: types.Type, b: types.Type) -> types.Type | None:
         if isinstance(a, Lanes):
-            return a if b in (a, a.dtype) else None
-        return b if isinstance(b, Lanes) and a == b.dtype else None
+            return a if b == a or isinstance(b, types.Float | types.Integer) else None
+        return b if isinstance(b, Lanes) and isinstance(a, types.Float | types.Integer) else None
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        lanes = context.get_value_type(sig.return_type)
+        lanes, number = context.get_value_type(sig.return_type), sig.return_type.dtype
         a, b = (
-            x if isinstance(t, Lanes) else _in_lanes(builder, x, lanes) for x, t in zip(args, sig.args, strict=True)
+            x if isinstance(t, Lanes) else _in_lanes(builder, context.cast(builder, x, t, number), lanes)
+            for x, t in zip(args, sig.args, strict=True)
         )
         return getattr(builder, instruction)(a, b, flags=_FLAGS)
 
     _typed(function, result)
-    for pair in ((Lanes, Lanes), (Lanes, types.Float), (types.Float, Lanes)):
+    numbers = (types.Float, types.Integer)
+    for pair in ((Lanes, Lanes), *((Lanes, n) for n in numbers), *((n, Lanes) for n in numbers)):
         lower_builtin(function, *pair)(lower)
 
 
@@ -177,19 +183,28 @@ def _of(row: types.Type) -> Lanes | None:
 
 
 _typed(width, lambda row: types.uint64 if _of(row) else None)
-_typed(spread, lambda number, row: _of(row))
+_typed(broadcast, lambda number, row: _of(row))
 _typed(load, lambda row, first: _of(row))
 _typed(store, lambda row, first, lanes: types.none if lanes == _of(row) else None)
 _typed(gather, lambda row, nodes, first: _of(row))
 _typed(scatter, lambda row, nodes, first, lanes: types.none if lanes == _of(row) else None)
 _typed(prefetch, lambda batch: types.none if isinstance(batch, types.Array) else None)
-_typed(first_of, lambda n, lanes, others: lanes if lanes == others and isinstance(lanes, Lanes) else None)
+_typed(select_first, lambda n, lanes, others: lanes if lanes == others and isinstance(lanes, Lanes) else None)
 _typed(shift, lambda before, lanes: lanes if before == lanes and isinstance(lanes, Lanes) else None)
 _typed(last, lambda lanes: lanes.dtype if isinstance(lanes, Lanes) else None)
-_typed(smaller, lambda a, b: a if a == b and isinstance(a, Lanes) else None)
+_typed(minimum, lambda a, b: a if a == b and isinstance(a, Lanes) else None)
 _typed(smallest, lambda lanes: lanes.dtype if isinstance(lanes, Lanes) else None)
-_typed(magnitude, lambda lanes: lanes if isinstance(lanes, Lanes) else None)
-_typed(root, lambda lanes: lanes if isinstance(lanes, Lanes) else None)
+for _function in (np.abs, np.sqrt, np.log):
+    _typed(_function, lambda lanes: lanes if isinstance(lanes, Lanes) else None)
+
+
+def _several(lanes: Lanes | None, count: types.Type) -> types.Type | None:
+    """A tuple of so many vectors; None if `count` is no constant."""
+    return types.UniTuple(lanes, count.literal_value) if lanes and isinstance(count, types.IntegerLiteral) else None
+
+
+_typed(load_each, lambda rows, count, first: _several(_of(rows), count))
+_typed(broadcast_each, lambda columns, count, column, n, row: _several(_of(row), count))
 
 
 def _pointer(context: Any, builder: Any, row_type: Any, row: Any, first: Any) -> Any:
@@ -210,8 +225,8 @@ def _width(context, builder, sig, args):  # type: ignore[no-untyped-def]
     return ir.Constant(_I64, Lanes(sig.args[0].dtype).width)
 
 
-@lower_builtin(spread, types.Float, types.Array)
-def _spread(context, builder, sig, args):  # type: ignore[no-untyped-def]
+@lower_builtin(broadcast, types.Float, types.Array)
+def _broadcast(context, builder, sig, args):  # type: ignore[no-untyped-def]
     number = context.cast(builder, args[0], sig.args[0], sig.return_type.dtype)
     return _in_lanes(builder, number, context.get_value_type(sig.return_type))
 
@@ -274,13 +289,15 @@ def _prefetch(context, builder, sig, args):  # type: ignore[no-untyped-def]
     return context.get_dummy_value()
 
 
-@lower_builtin(first_of, types.Integer, Lanes, Lanes)
-def _first_of(context, builder, sig, args):  # type: ignore[no-untyped-def]
-    n = sig.return_type.width
-    numbers = ir.VectorType(_I64, n)
-    places = ir.Constant(numbers, list(range(n)))
-    chosen = builder.icmp_unsigned("<", places, _in_lanes(builder, args[0], numbers))
-    return builder.select(chosen, args[1], args[2])
+def _first_lanes(builder: Any, n: Any, width: int) -> Any:
+    """Which of so many lanes are the first n."""
+    numbers = ir.VectorType(_I64, width)
+    return builder.icmp_unsigned("<", ir.Constant(numbers, list(range(width))), _in_lanes(builder, n, numbers))
+
+
+@lower_builtin(select_first, types.Integer, Lanes, Lanes)
+def _select_first(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    return builder.select(_first_lanes(builder, args[0], sig.return_type.width), args[1], args[2])
 
 
 @lower_builtin(shift, Lanes, Lanes)
@@ -295,8 +312,8 @@ def _last(context, builder, sig, args):  # type: ignore[no-untyped-def]
     return builder.extract_element(args[0], ir.Constant(_I32, sig.args[0].width - 1))
 
 
-@lower_builtin(smaller, Lanes, Lanes)
-def _smaller(context, builder, sig, args):  # type: ignore[no-untyped-def]
+@lower_builtin(minimum, Lanes, Lanes)
+def _minimum(context, builder, sig, args):  # type: ignore[no-untyped-def]
     return builder.select(builder.fcmp_ordered("<", args[1], args[0]), args[1], args[0])
 
 
@@ -319,5 +336,34 @@ def _unary(name: str) -> _Lower:
     return lower
 
 
-lower_builtin(magnitude, Lanes)(_unary("fabs"))
-lower_builtin(root, Lanes)(_unary("sqrt"))
+lower_builtin(np.abs, Lanes)(_unary("fabs"))
+lower_builtin(np.sqrt, Lanes)(_unary("sqrt"))
+# The processor has no logarithm of a vector: LLVM calls that of the mathematical library for each lane.
+lower_builtin(np.log, Lanes)(_unary("log"))
+
+
+@lower_builtin(load_each, types.Array, types.IntegerLiteral, types.Integer)
+def _load_each(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    rows_type, count, _ = sig.args
+    row_length = context.make_array(rows_type)(context, builder, args[0]).shape
+    length = builder.extract_value(row_length, rows_type.ndim - 1)
+    loaded = []
+    for row in range(count.literal_value):
+        start = builder.add(builder.mul(length, ir.Constant(length.type, row)), args[2])
+        place, align = _vector_pointer(context, builder, rows_type, args[0], start, sig.return_type.dtype.width)
+        loaded.append(builder.load(place, align=align))
+    return context.make_tuple(builder, sig.return_type, loaded)
+
+
+@lower_builtin(broadcast_each, types.Array, types.IntegerLiteral, types.Integer, types.Integer, types.Array)
+def _broadcast_each(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    columns_type, count = sig.args[:2]
+    length = builder.extract_value(context.make_array(columns_type)(context, builder, args[0]).shape, 1)
+    vector = context.get_value_type(sig.return_type.dtype)
+    chosen = _first_lanes(builder, args[3], vector.count)
+    made = []
+    for row in range(count.literal_value):
+        start = builder.add(builder.mul(length, ir.Constant(length.type, row)), args[2])
+        number = builder.load(_pointer(context, builder, columns_type, args[0], start))
+        made.append(builder.select(chosen, _in_lanes(builder, number, vector), ir.Constant(vector, None)))
+    return context.make_tuple(builder, sig.return_type, made)

@@ -6,7 +6,8 @@ import numpy as np
 from numba import njit
 from numba import uint64 as U
 
-from mpitled.kernels.stress import cofactor, inline, kernel
+from mpitled.kernels.templates import inline, kernel
+from mpitled.kernels.tensors import cofactor
 
 
 @njit(cache=True)

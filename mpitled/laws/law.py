@@ -32,6 +32,8 @@ class Law(BaseModel):
 
     #: Name in a deck.
     name: ClassVar[str]
+    #: How many `coefficients` there are.
+    n_coefficients: ClassVar[int]
 
     @property
     def coefficients(self) -> tuple[float, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 from mpitled.laws.law import Law
 
@@ -45,6 +46,10 @@ class Material:
     def wave_speed(self) -> float:
         """Speed of pressure waves in the undeformed solid, m/s."""
         return math.sqrt(self.p_wave_modulus / self.density)
+
+    def record(self) -> dict[str, Any]:
+        """The material as JSON can hold it."""
+        return {"name": self.name, "law": self.law.name, "density": self.density} | self.law.model_dump()
 
     def describe(self) -> str:
         """The material in one line, for tables and messages."""

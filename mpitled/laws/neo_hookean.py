@@ -17,6 +17,7 @@ class NeoHookean(Law):
     """
 
     name: ClassVar[str] = "neo-hookean"
+    n_coefficients: ClassVar[int] = 2
 
     youngs_modulus: float = parameter("Young's modulus, E", "Pa", gt=0)
     poissons_ratio: float = parameter("Poisson's ratio, nu", gt=-1, lt=0.5)

@@ -13,7 +13,7 @@ from mpitled.cells import hexahedra
 from mpitled.cells import support_domains as support
 from mpitled.deck import Deck, Sphere
 from mpitled.errors import InputError
-from mpitled.material import Material
+from mpitled.laws import Material
 from mpitled.mesh import Constraint, Mesh, Part, named_set
 from mpitled.meshing import block, checks, labels, phantoms
 from mpitled.meshing.cloud import in_millimetres, in_sphere, length, looks_like_metres

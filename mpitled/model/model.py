@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled.material import Material
+from mpitled.laws import Material
 
 #: How remarks begin that are warnings; the others are notes.
 WARNING = "warning: "

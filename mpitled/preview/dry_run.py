@@ -14,10 +14,11 @@ import numpy as np
 
 from mpitled import deck as decks
 from mpitled import job, resources
+from mpitled.cells.voxel_runs import SHORTEST_RUN
 from mpitled.deck import Deck
 from mpitled.errors import everywhere
 from mpitled.parallel.halo import World
-from mpitled.parallel.subdomain import SHORTEST_RUN, Subdomain
+from mpitled.parallel.subdomain import Subdomain
 from mpitled.preview import forecast
 from mpitled.solver.central_difference import March
 from mpitled.speed.witness import Call, distinct_bytes, witness

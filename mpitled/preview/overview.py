@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -80,11 +79,8 @@ def _deck(deck: Deck) -> Iterator[Item]:
     yield from _sets("cell set", mesh.cell_sets)
     counts = np.bincount(model.material, minlength=len(model.materials))
     for material, n in zip(model.materials, counts.tolist(), strict=True):
-        text = (
-            f"{material.name}: E {material.youngs_modulus:g} Pa, nu {material.poissons_ratio:g}, "
-            f"{material.density:g} kg/m3, {n} cells"
-        )
-        yield Item("material", text, {material.name: asdict(material) | {"cells": n}})
+        text = f"{material.describe()}, {n} cells"
+        yield Item("material", text, {material.name: material.record() | {"cells": n}})
     yield from _constraints((*deck.constraints(), *mesh.constraints), mesh.node_sets, 1e3, " mm")
     if deck.tumour:
         n = len(mesh.node_sets[model_build.TUMOUR])

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from mpitled import store
 from mpitled.cells import hexahedra
 from mpitled.errors import InputError
-from mpitled.material import Material
+from mpitled.laws import Material, NeoHookean
 from mpitled.mesh import METRES, Constraint, Mesh
 from mpitled.meshing import checks
 from mpitled.meshing.cloud import subdivide, volumes_and_centroids
@@ -715,9 +715,14 @@ def _materials(
                         f"warning: {given.origin}: material {given.name} has density {density:g} kg/m3; check "
                         "mesh.unit, mesh.stress_unit and mesh.density_unit"
                     )
-            material = Material(given.name, given.youngs_modulus * pascal, given.poissons_ratio, density)
-            if not np.isfinite([material.youngs_modulus, density, material.p_wave_modulus]).all():
+            modulus = given.youngs_modulus * pascal
+            try:
+                law = NeoHookean(youngs_modulus=float(modulus), poissons_ratio=float(given.poissons_ratio))
+            except ValueError:
+                modulus = np.inf
+            if not np.isfinite([modulus, density]).all() or not np.isfinite(law.p_wave_modulus):
                 raise InputError(f"{given.origin}: material {given.name} has a modulus or density without bounds")
+            material = Material(given.name, law, density)
             if name not in cell_sets:
                 continue  # all of its elements are left out
             if found.setdefault(name, material) != material:

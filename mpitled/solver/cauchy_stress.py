@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled.cells import hexahedra
-from mpitled.material import first_piola
+from mpitled.laws import first_piola
 from mpitled.store import PartRows
 
 #: Rows and columns of the components as VTK has them: xx, yy, zz, xy, yz, xz.
@@ -20,13 +20,16 @@ def cauchy(rows: PartRows, u: NDArray[np.float64], rule: str) -> NDArray[np.floa
 
     Hexahedra have the one of their one point, by the rule of their gradient; stabilisation is not in it.
     """
-    mu, lam = np.array([[m.mu, m.lam] for m in rows.materials]).T[:, rows.read("material"), None, None]
+    material = rows.read("material")
     made = np.empty((rows.n_own_cells, 6))
     for first, cells, gradients in _gradients(rows, rule):
-        own = slice(first, first + len(cells))
-        X = np.eye(3) + np.einsum("ian,naj->nij", u[:, cells.T], gradients)
-        stress = first_piola(X, lam[own], mu[own]) @ X.swapaxes(1, 2) / np.linalg.det(X)[:, None, None]
-        made[own] = stress[:, _ROWS, _COLUMNS]
+        of_block = material[first : first + len(cells)]
+        for number in np.unique(of_block):
+            own = np.flatnonzero(of_block == number)
+            F = np.eye(3) + np.einsum("ian,naj->nij", u[:, cells[own].T], gradients[own])
+            P = first_piola(rows.materials[number].law, F)
+            stress = P @ F.swapaxes(1, 2) / np.linalg.det(F)[:, None, None]
+            made[first + own] = stress[:, _ROWS, _COLUMNS]
     return made
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import kernels
 from mpitled.parallel.subdomain import Subdomain
 from mpitled.solver.step import State
 
@@ -37,37 +36,9 @@ class Survey:
         sub, required, jacobian = self.sub, self.required[0], self.jacobian
         required[:] = 0
         factor = (s.time_step / (2 * safety)) ** 2
-        strain = hourglass = stabilisation = 0.0
-        if (r := sub.runs) is not None:
-            strain, hourglass = kernels.voxel_survey(
-                s.seen,
-                r.line,
-                r.length,
-                r.along,
-                r.first_cell,
-                r.scale,
-                r.coefficient,
-                r.gram,
-                required,
-                factor,
-                jacobian,
-            )
-        if (h := sub.hexahedra) is not None:
-            more, resisted = kernels.hexahedron_survey(
-                s.seen, h.nodes, h.cells, h.geometry, h.coefficient, h.gram, h.stiffness, required, factor, jacobian
-            )
-            strain += more
-            hourglass += resisted
-        if (d := sub.domains) is not None:
-            more, stabilisation = kernels.domain_survey(
-                s.seen, d.nodes, d.cells, d.gradient, d.position, d.inverse, d.coefficient, d.gram, d.stiffness,
-                required, factor, jacobian, tensor,
-            )  # fmt: skip
-            strain += more
+        energies = dict.fromkeys(("strain", "hourglass", "stabilisation"), 0.0)
+        for cells in sub.packed:
+            for name, energy in cells.check(s.seen, required, factor, jacobian, tensor).items():
+                energies[name] += energy
         s.smallest_jacobian = min(s.smallest_jacobian, float(jacobian[:-1].min()))
-        return {
-            "strain": strain,
-            "hourglass": hourglass,
-            "stabilisation": stabilisation,
-            "min_jacobian": s.smallest_jacobian,
-        }
+        return energies | {"min_jacobian": s.smallest_jacobian}

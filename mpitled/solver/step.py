@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled import kernels
+from mpitled.cells.packing import Forces, PackedCells
 from mpitled.model.loading import loading_curve
 from mpitled.parallel.halo import Halo
 from mpitled.parallel.subdomain import Subdomain
@@ -95,51 +96,29 @@ def compose_forces(sub: Subdomain, halo: Halo | None) -> tuple[Term, ...]:
     held up for a moment does not hold up its neighbours.
     """
     if halo is None:
-        return _compose_cells(sub, slice(None), slice(None), slice(None))
-    borders = [cells.border if cells else 0 for cells in (sub.runs, sub.hexahedra, sub.domains)]
+        return _compose_cells(sub, lambda cells: slice(None))
     return (
-        *_compose_cells(sub, *(slice(n) for n in borders)),
+        *_compose_cells(sub, lambda cells: slice(cells.n_border)),
         ("halo", lambda s: halo.start(s.f)),
-        *_compose_cells(sub, *(slice(n, None) for n in borders)),
+        *_compose_cells(sub, lambda cells: slice(cells.n_border, None)),
         ("halo", lambda s: halo.finish(s.f)),
     )
 
 
-def _compose_cells(sub: Subdomain, of_runs: slice, of_hexahedra: slice, of_domains: slice) -> tuple[Term, ...]:
-    """The terms of some runs, and some batches of hexahedra and support domains."""
-    terms: list[Term] = []
-    runs, hexahedra, domains = sub.runs, sub.hexahedra, sub.domains
-    if runs is not None and len(runs.length[of_runs]):
-        some = [
-            np.ascontiguousarray(a[..., of_runs])
-            for a in (runs.line, runs.length, runs.along, runs.scale, runs.coefficient)
-        ]
+def _compose_cells(sub: Subdomain, part: Callable[[PackedCells], slice]) -> tuple[Term, ...]:
+    """The terms of a part of the runs and batches."""
+    return tuple(
+        (cells.name, _cell_forces(cells.forces(part(cells))))
+        for cells in sub.packed
+        if len(range(len(cells))[part(cells)])
+    )
 
-        def voxels(s: State) -> None:
-            J = kernels.voxel_forces(s.seen, s.f, *some)
-            s.smallest_jacobian = min(s.smallest_jacobian, J)
 
-        terms.append(("voxel hexahedra", voxels))
-    if hexahedra is not None and len(hexahedra.nodes[of_hexahedra]):
-        of_cells = [
-            a[of_hexahedra] for a in (hexahedra.nodes, hexahedra.in_row, hexahedra.geometry, hexahedra.coefficient)
-        ]
+def _cell_forces(forces: Forces) -> Callable[[State], None]:
+    def add(s: State) -> None:
+        s.smallest_jacobian = min(s.smallest_jacobian, forces(s.seen, s.f))
 
-        def general(s: State) -> None:
-            J = kernels.hexahedron_forces(s.seen, s.f, *of_cells)
-            s.smallest_jacobian = min(s.smallest_jacobian, J)
-
-        terms.append(("hexahedra", general))
-    if domains is not None and len(domains.nodes[of_domains]):
-        arrays = (domains.nodes, domains.gradient, domains.position, domains.inverse, domains.coefficient)
-        of_clouds = [None if a is None else a[of_domains] for a in arrays]
-
-        def support_domains(s: State) -> None:
-            J = kernels.domain_forces(s.seen, s.f, *of_clouds)
-            s.smallest_jacobian = min(s.smallest_jacobian, J)
-
-        terms.append(("support domains", support_domains))
-    return tuple(terms)
+    return add
 
 
 @dataclass(frozen=True, slots=True)

@@ -107,7 +107,7 @@ def _count(path: Path, stabilisation: float) -> dict[str, float]:
     whole = rows.n_own_domains // BATCH_LANES * BATCH_LANES  # lanes that fill the last batch are no work of cells
     n_hexahedra = rows.n_own_hexahedra
     sub = localise(replace(rows, n_own_domains=whole), HOURGLASS, stabilisation, "mean")
-    in_runs = int(sub.runs.length.sum()) if sub.runs else 0
+    in_runs = sum(cells.n_cells for cells in sub.packed if cells.name == "voxel hexahedra")
     work = {"voxel hexahedra": in_runs, "hexahedra": n_hexahedra - in_runs, "support domains": whole}
     sub, state = (with_values(part, _to_counting) for part in (sub, at_rest(sub, 1.0, 1e-6)))
     terms = (*compose_forces(sub, None), *compose_march(sub))

@@ -53,7 +53,7 @@ class Pace:
     def work(self) -> dict[str, int]:
         """Cells that the terms of forces have to do."""
         n_hexahedra = self.sub.rows.n_own_hexahedra
-        in_runs = int(self.sub.runs.length.sum()) if self.sub.runs else 0
+        in_runs = sum(cells.n_cells for cells in self.sub.packed if cells.name == "voxel hexahedra")
         return {
             "voxel hexahedra": in_runs,
             "hexahedra": n_hexahedra - in_runs,

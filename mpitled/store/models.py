@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from mpitled import hdf5_validation
 from mpitled.errors import InputError, damaged
-from mpitled.material import Material
+from mpitled.laws import Material, material_of
 from mpitled.model import Model
 from mpitled.store.files import (
     REBUILD,
@@ -31,7 +30,7 @@ from mpitled.store.files import (
 )
 
 #: Written into every model; a file of another layout is built anew, never read by guess.
-MODEL_LAYOUT = 2
+MODEL_LAYOUT = 3
 MODEL_ARRAYS = {
     "points": np.float64,
     "node_ids": np.int64,
@@ -90,7 +89,7 @@ def write_model(path: Path, model: Model, key: str, scene: Mapping[str, Any] | N
             put(file, "surface_areas", model.surface_areas)
         for name in ("node_sets", "cell_sets"):
             _write_sets(file.create_group(name), getattr(model, name))
-        write_json(file, "materials", [asdict(material) for material in model.materials])
+        write_json(file, "materials", [material.record() for material in model.materials])
         write_json(file, "figures", model.figures)
         write_json(file, "remarks", model.remarks)
         write_json(file, "scene", scene or {})
@@ -191,7 +190,7 @@ def model_contents(path: Path) -> dict[str, Any]:
             "support_domains": len(file["domains"]),
             "domain_nodes": file["domains"].shape[1],
             "prescribed_dofs": len(file["prescribed_dofs"]),
-            "materials": [asdict(material) for material in read_materials(file)],
+            "materials": [material.record() for material in read_materials(file)],
             "node_sets": {name: len(members) for name, members in _read_sets(file["node_sets"]).items()},
             "cell_sets": {name: len(members) for name, members in _read_sets(file["cell_sets"]).items()},
             "figures": _read_figures(file),
@@ -208,10 +207,7 @@ def describe_model(path: Path) -> str:
         f"support domains  {has['support_domains']} of {has['domain_nodes']} nodes",
         f"prescribed dofs  {has['prescribed_dofs']}",
     ]
-    lines += [
-        f"material         {m.name}: E {m.youngs_modulus:g} Pa, nu {m.poissons_ratio:g}, {m.density:g} kg/m3"
-        for m in (Material(**values) for values in has["materials"])
-    ]
+    lines += [f"material         {material_of(record).describe()}" for record in has["materials"]]
     for kind in ("node_sets", "cell_sets"):
         lines += [f"{kind[:-1].replace('_', ' '):16} {name}: {n}" for name, n in has[kind].items()]
     lines += [f"{name}: {value:.6g}" for name, value in has["figures"].items()]
@@ -288,10 +284,9 @@ def _read_sets(group: h5py.Group) -> dict[str, NDArray[np.int64]]:
 
 def read_materials(file: h5py.File) -> tuple[Material, ...]:
     """The materials of a model, by number. ValueError if they are none."""
-    materials = tuple(Material(**values) for values in read_json(file, "materials"))
+    materials = tuple(material_of(record) for record in read_json(file, "materials"))
     for material in materials:
-        _, *numbers = asdict(material).values()
-        if not np.isfinite(numbers).all() or not np.isfinite([material.lam, material.mu]).all():
+        if not np.isfinite([material.density, material.lam, material.mu, *material.law.coefficients]).all():
             raise ValueError(f"material {material.name} has moduli that are no numbers")
     return materials
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled.errors import InputError, damaged
-from mpitled.material import Material
+from mpitled.laws import Material
 from mpitled.store.files import REBUILD, check_room, matching, open_file, put, read_rows, replacing
 from mpitled.store.models import check_ascending, check_finite, check_numbers, open_model, read_materials
 

@@ -1,26 +1,101 @@
-"""Kernels of support domains, gathered: any number of nodes, stabilised or the paper's own."""
+"""Support domains, gathered in lanes: packing and kernels, for any number of nodes, stabilised or the paper's own."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import numpy as np
 from numba import uint64 as U
+from numpy.typing import NDArray
 
-from mpitled.kernels.lanes import (
-    BATCH,
-    gather,
-    load,
-    magnitude,
-    root,
-    scatter,
-    smaller,
-    smallest,
-    spread,
-    store,
-    width,
-)  # fmt: skip
-from mpitled.kernels.stress import batch_survey, cofactor, first_piola, inline, kernel
+from mpitled.cells.packing import Forces, LocalCells, border_first, in_lanes, in_precision, symmetric
+from mpitled.cells.support_domains import linear_projector, stabilisation_stiffness
+from mpitled.kernels.lanes import BATCH, broadcast, gather, load, load_each, minimum, scatter, smallest, store, width
+from mpitled.kernels.templates import (
+    N_COEFFICIENTS,
+    compile_for,
+    inline,
+    inline_template,
+    law_stress,
+    law_tangent_bound,
+)
+from mpitled.kernels.tensors import check_batch, deformation
+from mpitled.laws import Law
 
 _BATCH = np.uint64(BATCH)
+
+
+@dataclass(frozen=True, slots=True)
+class SupportDomainBatches:
+    """Support domains of one law in lanes (`PackedCells`)."""
+
+    name: ClassVar[str] = "support domains"
+
+    law: type[Law]
+    nodes: NDArray[np.uint32]  # (n_batches, n, lanes)
+    cells: NDArray[np.uint32]  # (n_batches, lanes)
+    gradient: NDArray[np.floating]  # (n_batches, 3 n, lanes), 1/m
+    position: NDArray[np.floating] | None  # (n_batches, 3 n, lanes), m; None without stabilisation
+    inverse: NDArray[np.floating] | None  # (n_batches, 6, lanes), 1/m^2
+    coefficient: NDArray[np.floating]  # (n_batches, n_coefficients + 1, lanes)
+    gram: NDArray[np.floating]  # (n_batches, 6, lanes), 1/m^2
+    stiffness: NDArray[np.floating]  # (n_batches, lanes), N/m
+    n_cells: int
+    n_border: int
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    def forces(self, part: slice) -> Forces:
+        """See `PackedCells.forces`."""
+        kernel = compile_for(forces_template, self.law)
+        columns = (self.nodes, self.gradient, self.position, self.inverse, self.coefficient)
+        arrays = [None if a is None else a[part] for a in columns]
+        return lambda u, f: kernel(u, f, *arrays)
+
+    def check(
+        self,
+        u: NDArray[np.floating],
+        required: NDArray[np.float64],
+        factor: float,
+        jacobian: NDArray[np.float32],
+        tensor: NDArray[np.float64] | None,
+    ) -> dict[str, float]:
+        """See `PackedCells.check`."""
+        strain, stabilisation = compile_for(check_template, self.law)(
+            u, self.nodes, self.cells, self.gradient, self.position, self.inverse, self.coefficient, self.gram,
+            self.stiffness, required, factor, jacobian, tensor,
+        )  # fmt: skip
+        return {"strain": strain, "stabilisation": stabilisation}
+
+
+def pack(cells: LocalCells, stabilisation: float) -> list[SupportDomainBatches]:
+    """Support domains in batches of one law each; stabilisation is the share s (0: the paper's own domains)."""
+    packed = []
+    for law, rows in cells.by_law():
+        nodes, volume, gradients = cells.nodes[rows], cells.column("volumes")[rows], cells.column("gradients")[rows]
+        position, inverse = linear_projector(cells.points[nodes])
+        lam, mu = cells.moduli(rows)
+        kappa = stabilisation_stiffness(inverse, volume, lam + 2 * mu, stabilisation)
+        coefficient = np.concatenate([cells.coefficients(law, rows) * volume, kappa[None]]).T
+        arrays = border_first(
+            cells.shared,
+            nodes=in_lanes(nodes),
+            cells=in_lanes((cells.first + rows)[:, None].astype(np.uint32), cells.n_rank_cells)[:, 0],
+            gradient=in_lanes(gradients),
+            position=in_lanes(position) if stabilisation > 0 else None,
+            inverse=in_lanes(symmetric(inverse)) if stabilisation > 0 else None,
+            coefficient=in_lanes(coefficient, 0),
+            gram=in_lanes(symmetric(np.einsum("gai,gaj->gij", gradients, gradients))),
+            # The projector Q has the largest eigenvalue 1.
+            stiffness=in_lanes(kappa[:, None], 0)[:, 0],
+        )
+        packed.append(in_precision(SupportDomainBatches(law=law, n_cells=len(rows), **arrays), cells.precision))
+    return packed
+
+
+# ---------------------------------------------------------------- kernels
 
 
 @inline
@@ -58,7 +133,7 @@ def _domain_modes(u, nodes, gradient, position, inverse, w, ue):  # type: ignore
     """
     n = U(nodes.shape[0])
     share = u.dtype.type(1) / u.dtype.type(nodes.shape[0])
-    zeros = spread(u.dtype.type(0), u[0])
+    zeros = broadcast(u.dtype.type(0), u[0])
     gx = (zeros, zeros, zeros)
     gy = (zeros, zeros, zeros)
     gz = (zeros, zeros, zeros)
@@ -101,17 +176,15 @@ def _domain_modes(u, nodes, gradient, position, inverse, w, ue):  # type: ignore
     return gx + gy + gz, none, none, none
 
 
-@kernel
-def domain_forces(u, f, nodes, gradient, position, inverse, coefficient):  # type: ignore[no-untyped-def]
+def forces_template(u, f, nodes, gradient, position, inverse, coefficient):  # type: ignore[no-untyped-def]
     """Add the nodal forces of support domains to f; the smallest J among them.
 
     nodes (n_batches, n, lanes) uint32; gradient and position (n_batches, 3 n, lanes), 1/m and m; inverse (n_batches, 6,
-    lanes), 1/m^2; coefficient (n_batches, 3, lanes): mu V, lambda V (J), stabilisation kappa (N/m). position and
-    inverse are None where there is no stabilisation (the paper's own).
+    lanes), 1/m^2; coefficient (n_batches, n + 1, lanes): the law's n coefficients times V (J), then the stabilisation
+    kappa (N/m). position and inverse are None where there is no stabilisation (the paper's own).
     """
     n = U(nodes.shape[1])
-    one = u.dtype.type(1)
-    least = spread(u.dtype.type(np.inf), u[0])
+    least = broadcast(u.dtype.type(np.inf), u[0])
     ue = np.empty((3 * nodes.shape[1], width(u[0])), u.dtype)
     for batch in range(U(nodes.shape[0])):
         at = nodes[batch]
@@ -120,10 +193,9 @@ def domain_forces(u, f, nodes, gradient, position, inverse, coefficient):  # typ
         inner = inverse[batch] if inverse is not None else None
         for w in range(U(0), _BATCH, width(u[0])):
             grad, ax, ay, az = _domain_modes(u, at, b, X, inner, w, ue)
-            mu = load(coefficient[batch, 0], w)
-            lam = load(coefficient[batch, 1], w)
-            p = first_piola(grad, mu, lam, one, None)
-            least = smaller(least, p[9])
+            F, K, J = deformation(grad)
+            p = law_stress(F, K, J, load_each(coefficient[batch], N_COEFFICIENTS, w))
+            least = minimum(least, J)
             for a in range(n):
                 i = U(3) * a
                 x = load(b[i], w)
@@ -133,7 +205,7 @@ def domain_forces(u, f, nodes, gradient, position, inverse, coefficient):  # typ
                 fy = p[3] * x + p[4] * y + p[5] * z
                 fz = p[6] * x + p[7] * y + p[8] * z
                 if position is not None:
-                    k = load(coefficient[batch, 2], w)
+                    k = load(coefficient[batch, N_COEFFICIENTS], w)
                     x = load(X[i], w)
                     y = load(X[i + U(1)], w)
                     z = load(X[i + U(2)], w)
@@ -154,38 +226,30 @@ def _image(k, x, y, z):  # type: ignore[no-untyped-def]
 
 @inline
 def _length(v):  # type: ignore[no-untyped-def]
-    return root(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    return np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
 
 
-@inline
-def _add_tensors(grad, nodes, gradient, coefficient, stiffness, w, tensor, factor, one, value):  # type: ignore[no-untyped-def]
+@inline_template
+def _add_tensors(grad, nodes, gradient, coefficient, stiffness, w, tensor, factor, value):  # type: ignore[no-untyped-def]
     """Add the bounds of some lanes' stiffness at their nodes, times factor, to tensor (6, n_nodes).
 
     value (6, lanes): scratch.
     """
     n = U(nodes.shape[0])
     tiny = value.dtype.type(1e-30)
-    a, b, c, d, e, f, g, h, i = grad
-    a = a + one
-    e = e + one
-    i = i + one
-    k = cofactor(a, b, c, d, e, f, g, h, i)
-    J = k[9]
-    square = a * a + b * b + c * c + d * d + e * e + f * f + g * g + h * h + i * i
-    sum_g = spread(value.dtype.type(0), value[0])
+    F, K, J = deformation(grad)
+    a, b = law_tangent_bound(F, K, J, load_each(coefficient, N_COEFFICIENTS, w))
+    sum_g = broadcast(value.dtype.type(0), value[0])
     sum_b = sum_g
     for m in range(n):
         B = (load(gradient[U(3) * m], w), load(gradient[U(3) * m + U(1)], w), load(gradient[U(3) * m + U(2)], w))
-        sum_g = sum_g + _length(_image(k, B[0], B[1], B[2]))
+        sum_g = sum_g + _length(_image(K, B[0], B[1], B[2]))
         sum_b = sum_b + _length(B)
-    mu = load(coefficient[0], w)
-    lam = load(coefficient[1], w)
-    q = lam * (J - one) - mu / J
-    along = factor * (lam + mu / (J * J)) * sum_g
-    alike = factor * (mu + magnitude(q) * root((one + one) * square)) * sum_b
+    along = factor * a * sum_g
+    alike = factor * b * sum_b
     for m in range(n):
         B = (load(gradient[U(3) * m], w), load(gradient[U(3) * m + U(1)], w), load(gradient[U(3) * m + U(2)], w))
-        G = _image(k, B[0], B[1], B[2])
+        G = _image(K, B[0], B[1], B[2])
         s = along / (_length(G) + tiny)
         same = alike * _length(B) + factor * load(stiffness, w)
         store(value[0], U(0), s * G[0] * G[0] + same)
@@ -199,8 +263,7 @@ def _add_tensors(grad, nodes, gradient, coefficient, stiffness, w, tensor, facto
                 tensor[j, nodes[m, w + lane]] += value[j, lane]
 
 
-@kernel
-def domain_survey(  # type: ignore[no-untyped-def]
+def check_template(  # type: ignore[no-untyped-def]
     u,
     nodes,
     cells,
@@ -215,7 +278,7 @@ def domain_survey(  # type: ignore[no-untyped-def]
     jacobian,
     tensor,
 ):
-    """As `hexahedron_survey`, of support domains: strain energy and stabilisation energy.
+    """As `voxel_runs.check_template`, of support domains: strain energy and stabilisation energy.
 
     Where tensor (6, n_nodes) is given, it takes what the domains ask, as tensors, in place of required. A domain's
     material stiffness is that of one direction g_a = K B_a at each node: c (sum_a g_a . u_a)^2. By Cauchy's inequality
@@ -223,7 +286,6 @@ def domain_survey(  # type: ignore[no-untyped-def]
     tumour the first is large across the thin layers and small along them.
     """
     n = U(nodes.shape[1])
-    one = u.dtype.type(1)
     factor = u.dtype.type(factor)
     ue = np.empty((3 * nodes.shape[1], width(u[0])), u.dtype)
     value = np.empty((4, BATCH), u.dtype)
@@ -237,8 +299,8 @@ def domain_survey(  # type: ignore[no-untyped-def]
         inner = inverse[batch] if inverse is not None else None
         for w in range(U(0), _BATCH, width(u[0])):
             grad, ax, ay, az = _domain_modes(u, at, b, X, inner, w, ue)
-            batch_survey(grad, coefficient[batch], gram[batch], stiffness[batch], w, value, one)
-            squares = spread(u.dtype.type(0), u[0])
+            check_batch(grad, coefficient[batch], gram[batch], stiffness[batch], w, value)
+            squares = broadcast(u.dtype.type(0), u[0])
             if position is not None:
                 for a in range(n):
                     i = U(3) * a
@@ -251,11 +313,11 @@ def domain_survey(  # type: ignore[no-untyped-def]
                     squares = squares + (rx * rx + ry * ry + rz * rz)
             store(value[3], w, squares)
             if tensor is not None:
-                _add_tensors(grad, at, b, coefficient[batch], stiffness[batch], w, tensor, factor, one, scratch)
+                _add_tensors(grad, at, b, coefficient[batch], stiffness[batch], w, tensor, factor, scratch)
         for w in range(_BATCH):
             jacobian[cells[batch, w]] = value[0, w]
-            strain += value[1, w] - coefficient[batch, 0, w] * np.log(value[0, w])
-            stabilisation += coefficient[batch, 2, w] * value[3, w]
+            strain += value[1, w]
+            stabilisation += coefficient[batch, N_COEFFICIENTS, w] * value[3, w]
             if tensor is None:
                 for a in range(n):
                     required[at[a, w]] += factor * value[2, w]
