@@ -9,51 +9,42 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import tomlkit
+
 from mpitled import atomic, deck, toml
 from mpitled.errors import InputError
 
 #: A label image that a clone of the repository has; others give their own.
 _IMAGE = Path(__file__).parents[1] / "jobs" / "data" / "mni152_labels_1mm.nii.gz"
-_MATERIAL = {"youngs_modulus": 3000.0, "poissons_ratio": 0.49}
-_CSF = {"youngs_modulus": 10.0, "poissons_ratio": 0.1, "cells": ["left_ventricle", "right_ventricle"]}
-_BRAIN: dict[str, Any] = {"material": {"brain": _MATERIAL}}
-_FIXED: dict[str, Any] = {"fixed": [{"nodes": "surface"}]}
+_BRAIN = "material.brain = {youngs_modulus = 3000.0, poissons_ratio = 0.49}"
 #: The values that are not defaults, by kind of scene.
-_SCENES: dict[str, dict[str, Any]] = {
-    "brain": {
-        "labels": {},
-        "tumour": {"centre": [-32.0, -20.0, 10.0], "volume": 4188.8, "surface_nodes": 1600},
-        "material": {"brain": _MATERIAL | {"cells": ["tissue"]}, "csf": _CSF},
-        "fixed": [{"nodes": "skull"}],
-    },
-    "decks": {
-        "mesh": {},
-        **_BRAIN,
-        "fixed": [{"nodes": "x0"}],
-        "displaced": [{"nodes": "x1", "displacement": [4.0, 0.0, 0.0]}],
-    },
-    "block": {
-        "block": {"size": [48.0, 40.0, 40.0], "elements": [12, 10, 10], "cloud": "core"},
-        "tumour": {"centre": [24.0, 20.0, 20.0], "volume": 523.6},
-        "cloud": {"radius": 11.0},
-        **_BRAIN,
-        **_FIXED,
-    },
-    "cylinder": {
-        "cylinder": {"radius": 20.0, "height": 40.0, "cloud": "core"},
-        **_BRAIN,
-        "fixed": [{"nodes": "bottom"}],
-        "displaced": [{"nodes": "top", "displacement": [0.0, 0.0, 4.0]}],
-    },
-    "ellipsoid": {
-        "ellipsoid": {"semi_axes": [40.0, 32.0, 32.0], "cloud": "core"},
-        "tumour": {"centre": [0.0, 0.0, 0.0], "volume": 523.6},
-        **_BRAIN,
-        **_FIXED,
-    },
+_SCENES = {
+    "brain": """
+tumour = {centre = [-32.0, -20.0, 10.0], volume = 4188.8, surface_nodes = 1600}
+material.brain = {youngs_modulus = 3000.0, poissons_ratio = 0.49, cells = ["tissue"]}
+material.csf = {youngs_modulus = 10.0, poissons_ratio = 0.1, cells = ["left_ventricle", "right_ventricle"]}
+fixed = [{nodes = "skull"}]""",
+    "decks": f"""{_BRAIN}
+fixed = [{{nodes = "x0"}}]
+displaced = [{{nodes = "x1", displacement = [4.0, 0.0, 0.0]}}]""",
+    "block": f"""{_BRAIN}
+block = {{size = [48.0, 40.0, 40.0], elements = [12, 10, 10], cloud = "core"}}
+tumour = {{centre = [24.0, 20.0, 20.0], volume = 523.6}}
+cloud = {{radius = 11.0}}
+fixed = [{{nodes = "surface"}}]""",
+    "cylinder": f"""{_BRAIN}
+cylinder = {{radius = 20.0, height = 40.0, cloud = "core"}}
+fixed = [{{nodes = "bottom"}}]
+displaced = [{{nodes = "top", displacement = [0.0, 0.0, 4.0]}}]""",
+    "ellipsoid": f"""{_BRAIN}
+ellipsoid = {{semi_axes = [40.0, 32.0, 32.0], cloud = "core"}}
+tumour = {{centre = [0.0, 0.0, 0.0], volume = 523.6}}
+fixed = [{{nodes = "surface"}}]""",
 }
 #: The block whose meshes are written beside a deck of meshes.
-_SAMPLE = {"block": {"size": [40.0, 20.0, 20.0], "elements": [8, 5, 5], "cloud": "core"}, **_BRAIN, **_FIXED}
+_SAMPLE = f"""{_BRAIN}
+block = {{size = [40.0, 20.0, 20.0], elements = [8, 5, 5], cloud = "core"}}
+fixed = [{{nodes = "x0"}}]"""
 #: Sections that every deck shows, with their defaults if there is nothing to choose.
 _SHOWN = ("cloud", "support", "hexahedra", "solver", "output", "partition")
 
@@ -73,7 +64,7 @@ def write(kind: str, path: Path) -> list[Path]:
 
 def text(kind: str, path: Path, meshes: Sequence[Path] = ()) -> str:
     """The deck for a path; InputError if it reads meshes and none are given."""
-    scene = dict(_SCENES[kind])
+    scene: dict[str, Any] = tomlkit.parse(_SCENES[kind]).unwrap()
     if kind == "brain":
         scene["labels"] = {"image": os.path.relpath(_IMAGE, path.parent) if _IMAGE.exists() else "labels.nii.gz"}
     elif kind == "decks":
@@ -86,21 +77,21 @@ def text(kind: str, path: Path, meshes: Sequence[Path] = ()) -> str:
         f"# 'mpitled check {path.name}' shows what is in it, 'mpitled run {path.name}' computes it.",
         *_keys("", {"title": f"A scene of kind {kind}"}),
     ]
-    for section in dict.fromkeys([*scene, *_SHOWN]):
-        home = next(home for home in deck.homes() if home.section == section)
-        given = scene.get(section, {})
-        entries = dict(enumerate(given)) if isinstance(given, list) else given if home.depth == 3 else {"": given}
-        for name, values in entries.items():
-            lines += ["", f"# {home.about}", home.heading.replace("NAME", str(name)), *_keys(section, values)]
+    for home in deck.homes()[1:]:
+        given = scene.get(home.section, {} if home.section in _SHOWN else None)
+        if given is not None and not home.law:
+            entries = dict(enumerate(given)) if isinstance(given, list) else given if home.depth == 3 else {"": given}
+            for name, values in entries.items():
+                heading = home.heading.replace("NAME", str(name))
+                lines += ["", f"# {home.about}", heading, *_keys(home.section, values)]
     return "\n".join(lines) + "\n"
-
 
 
 def _keys(section: str, values: dict[str, Any]) -> Iterator[str]:
     """Every key of a section with its meaning; as a comment if its value is not given."""
     for name, key in deck.keys_of(section).items():
         yield f"# {key['description']}; {deck.expected(key)}"
-        default = toml.value(key["default"]) if key.get("default") not in (None, ()) else ""
+        default = toml.value(key["default"]) if "default" in key else ""
         yield f"{name} = {toml.value(values[name])}" if name in values else f"# {name} = {default}".rstrip()
 
 
@@ -111,7 +102,7 @@ def _write_meshes(folder: Path) -> list[Path]:
 
     with tempfile.TemporaryDirectory() as temporary:
         sample, model = Path(temporary) / "sample.toml", Path(temporary) / "model.h5"
-        sample.write_text("\n".join(toml.lines(_SAMPLE)))
+        sample.write_text(_SAMPLE)
         scene = deck.load_deck(sample)
         store.write_model(model, model_build.build(scene), "", deck.canonical(scene))
         *meshes, _ = export.write_abaqus(model, Path(temporary) / "export")

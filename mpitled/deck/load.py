@@ -162,28 +162,24 @@ def _conflicts(deck: Deck, table: dict[str, Any]) -> Iterator[tuple[tuple[Any, .
         yield (), f"{found}; give exactly one of {', '.join(f'[{name}]' for name in GEOMETRIES)}"
     if not deck.materials and not deck.mesh:
         yield (), "has no material; give at least one [material.NAME]"
-    owner: dict[str, str] = {}
-    for material in deck.materials:
-        for cells in material.cells:
-            if other := owner.get(cells):
-                reason = f"{cells} is filled by material.{other} already; give each set of cells one material"
-                yield ("material", material.name, "cells"), reason
-            owner[cells] = material.name
+    yield from _repeated({("material", material.name, "cells"): material.cells for material in deck.materials})
     if deck.support.nodes < deck.support.basis:
         reason = f"is fewer than the {deck.support.basis} monomials of support.basis; give at least as many"
         yield ("support", "nodes"), reason
     if deck.labels:
-        named: dict[int, str] = {}
-        for name in ("tissue", "left_ventricle", "right_ventricle"):
-            for label in getattr(deck.labels, name):
-                if label in named:
-                    remedy = "give each label one place"
-                    if named[label] == "left_ventricle":
-                        remedy = "give it to labels.left_ventricle and leave labels.right_ventricle = []"
-                    yield ("labels", name), f"label {label} is in labels.{named[label]} already; {remedy}"
-                named[label] = name
+        ventricles = ("left_ventricle", "right_ventricle")
+        yield from _repeated({("labels", name): getattr(deck.labels, name) for name in ("tissue", *ventricles)})
     if deck.tumour:
-        yield from _tumour_conflicts(deck, table)
+        radius = table["tumour"]["seed_radius"]
+        seed_volume = 4 / 3 * math.pi * radius**3
+        if table["tumour"]["volume"] < seed_volume:
+            reason = f"is less than the seed's {seed_volume:.4g} mm3; give more, or a smaller tumour.seed_radius"
+            yield ("tumour", "volume"), reason
+        if deck.cloud.radius <= deck.tumour.seed_radius and not deck.mesh:
+            yield ("cloud", "radius"), f"lies within the seed; give more than tumour.seed_radius = {radius:g} mm"
+        for name, shape in (("block", deck.block), ("cylinder", deck.cylinder)):
+            if shape and shape.cloud == "none":
+                yield (name, "cloud"), 'leaves no cloud in which the tumour can grow; give "core" or "all"'
     spheres = ", ".join(deck.sphere) or "there are none"
     if deck.block and deck.block.fitted is not None and deck.block.fitted not in deck.sphere:
         yield ("block", "fitted"), f"is none of the spheres ({spheres}); add [sphere.{deck.block.fitted}]"
@@ -205,18 +201,14 @@ def _conflicts(deck: Deck, table: dict[str, Any]) -> Iterator[tuple[tuple[Any, .
         yield ("solver", "time_step"), f"is longer than solver.load_time; give less than {deck.solver.load_time:g} s"
 
 
-def _tumour_conflicts(deck: Deck, table: dict[str, Any]) -> Iterator[tuple[tuple[str, str], str]]:
-    assert deck.tumour is not None
-    radius = table["tumour"]["seed_radius"]
-    seed_volume = 4 / 3 * math.pi * radius**3
-    if table["tumour"]["volume"] < seed_volume:
-        reason = f"is less than the seed's {seed_volume:.4g} mm3; give more, or a smaller tumour.seed_radius"
-        yield ("tumour", "volume"), reason
-    if deck.cloud.radius <= deck.tumour.seed_radius and not deck.mesh:
-        yield ("cloud", "radius"), f"lies within the seed; give more than tumour.seed_radius = {radius:g} mm"
-    for name, shape in (("block", deck.block), ("cylinder", deck.cylinder)):
-        if shape and shape.cloud == "none":
-            yield (name, "cloud"), 'leaves no cloud in which the tumour can grow; give "core" or "all"'
+def _repeated(lists: Mapping[tuple[str, ...], Sequence[Any]]) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Entries that are in two lists, by the parts of the names of their keys."""
+    first: dict[Any, str] = {}
+    for way, entries in lists.items():
+        for entry in entries:
+            if entry in first:
+                yield way, f"{entry} is in {first[entry]} already; keep it in one of the two"
+            first[entry] = ".".join(way)
 
 
 # --- TOML ----------------------------------------------------------------------------------------------------------
@@ -271,17 +263,15 @@ def _override(table: dict[str, Any], text: str, option: str) -> str:
         parsed = value
     inner: Any = table
     for depth, step in enumerate(steps):
-        within = ".".join(steps[:depth])
-        if isinstance(inner, list):
-            if not step.isdecimal() or int(step) >= len(inner):
-                raise InputError(f"{origin}: the deck has {len(inner)} [[{within}]]; count them from 0")
-        elif not isinstance(inner, dict):
-            raise InputError(f"{origin}: {within} is a value, not a section; leave out .{step}")
-        at: Any = int(step) if isinstance(inner, list) else step
+        listed = isinstance(inner, list)
+        if listed and not (step.isdecimal() and int(step) < len(inner)):
+            raise InputError(f"{origin}: the deck has {len(inner)} [[{'.'.join(steps[:depth])}]]; count them from 0")
+        at: Any = int(step) if listed else step
         if depth == len(steps) - 1:
             inner[at] = parsed
-        else:
-            inner = inner[at] if isinstance(inner, list) else inner.setdefault(at, {})
+        elif not isinstance(inner[at] if listed else inner.get(at), dict | list):
+            inner[at] = {}
+        inner = inner[at]
     return name
 
 

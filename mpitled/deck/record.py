@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mpitled.deck.describe import shown
-from mpitled.deck.schema import GEOMETRIES, Deck, Section, from_si, unit_of_field
+from mpitled.deck.schema import GEOMETRIES, Deck, Section, from_si
 from mpitled.laws import Law
 
 _PHYSICS = (*GEOMETRIES, "tumour", "sphere", "material", "fixed", "displaced")
@@ -36,8 +36,8 @@ def _table(deck: Deck, name_of: Callable[[Path], str | None]) -> dict[str, Any]:
 
 def _plain(value: Any, name_of: Callable[[Path], str | None], unit: str = "") -> Any:
     if isinstance(value, Section):
-        keys = [name for name, field in type(value).model_fields.items() if not field.alias]
-        table = {name: _plain(getattr(value, name), name_of, unit_of_field(type(value), name)) for name in keys}
+        keys = [name for name, field in type(value).model_fields.items() if not field.validation_alias]
+        table = {name: _plain(getattr(value, name), name_of, value.unit_of(name)) for name in keys}
         table |= table.pop("law", {})
         return {name: inner for name, inner in table.items() if inner is not None}
     if isinstance(value, Law):

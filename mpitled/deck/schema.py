@@ -11,17 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ValidationInfo,
-    WithJsonSchema,
-    field_validator,
-    model_validator,
-)
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, WithJsonSchema
+
+from pydantic import InstanceOf, field_validator, model_validator  # isort: skip
 from pydantic.json_schema import SkipJsonSchema
 from pydantic_core import PydanticCustomError
 
@@ -52,15 +44,9 @@ def from_si(value: Any, unit: str) -> Any:
 
 
 def key(meaning: str, default: Any = ..., unit: str = "", **limits: Any) -> Any:
-    """A key; `default` and `limits`, as pydantic has them, are in the deck's `unit`. Without a default it is required."""
+    """A key of a section. `default` and `limits`, as in pydantic, are in the deck's `unit`; no default: required."""
     extra = {"unit": unit} | ({} if default in (..., None) else {"default": default})
     return Field(to_si(default, unit), description=meaning, json_schema_extra=extra, **limits)
-
-
-def unit_of_field(section: type[BaseModel], name: str) -> str:
-    """The unit of a field in a deck; "" if the field has none."""
-    extra = section.model_fields[name].json_schema_extra
-    return str(extra.get("unit", "")) if isinstance(extra, dict) else ""
 
 
 def _check_distinct(values: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -69,7 +55,7 @@ def _check_distinct(values: tuple[Any, ...]) -> tuple[Any, ...]:
     return values
 
 
-def _check_exists(value: Any, info: ValidationInfo) -> Any:
+def _check_file(value: Any, info: ValidationInfo) -> Any:
     """The path of a file that a deck names; the context of the validation is the deck's folder."""
     if info.context is None or not isinstance(value, str):
         return value
@@ -91,10 +77,12 @@ def _add_names(tables: Any) -> Any:
 
 _T = TypeVar("_T")
 _Distinct = Annotated[tuple[_T, ...], AfterValidator(_check_distinct)]
-_File = Annotated[Path, BeforeValidator(_check_exists)]
-#: Sections [section.NAME], by name.
-_Named = Annotated[dict[str, _T], BeforeValidator(_add_names)]
+_Named = Annotated[dict[str, _T], BeforeValidator(_add_names)]  # sections [section.NAME]
+_File = Annotated[Path, BeforeValidator(_check_file)]
 _Positive = Annotated[float, Field(gt=0)]
+_NotNegative = Annotated[float, Field(ge=0)]
+_Fraction = Annotated[float, Field(gt=0, lt=1)]
+_Share = Annotated[float, Field(gt=0, le=1)]
 _Integer = Annotated[int, Field(lt=2**31)]
 _Count = Annotated[_Integer, Field(ge=1)]
 _Vector = tuple[float, float, float]
@@ -106,9 +94,6 @@ _Axis = Literal["x", "y", "z"]
 _XYZ = ("x", "y", "z")
 
 
-# --- the sections --------------------------------------------------------------------------------------------------
-
-
 class Section(BaseModel):
     """A section of a deck: immutable, strict about types, without unknown keys."""
 
@@ -117,9 +102,13 @@ class Section(BaseModel):
     @field_validator("*", mode="after")
     @classmethod
     def _convert(cls, value: Any, info: ValidationInfo) -> Any:
-        if info.context is None or info.field_name is None:
-            return value
-        return to_si(value, unit_of_field(cls, info.field_name))
+        return value if info.context is None else to_si(value, cls.unit_of(str(info.field_name)))
+
+    @classmethod
+    def unit_of(cls, name: str) -> str:
+        """The unit of a field in a deck; "" if the field has none."""
+        extra = cls.model_fields[name].json_schema_extra
+        return str(extra.get("unit", "")) if isinstance(extra, dict) else ""
 
 
 class Labels(Section):
@@ -139,7 +128,7 @@ class Block(Section):
     size: _Sizes = key("edges along x, y, z", unit="mm")
     elements: tuple[_Count, _Count, _Count] = key("number of hexahedra along x, y, z")
     cloud: _Replaced = key("what the cloud replaces: nothing, an inner block, everything", "none")
-    core_share: float = key('share of each edge that `cloud = "core"` replaces', 0.5, gt=0, lt=1)
+    core_share: _Fraction = key('share of each edge that `cloud = "core"` replaces', 0.5)
     fitted: str | None = key("name of a [sphere.NAME] that hexahedra follow; `elements` are then along the edges", None)
 
 
@@ -150,11 +139,8 @@ class Cylinder(Section):
     height: _Positive = key("height", unit="mm")
     element_size: _Positive = key("mean edge of a hexahedron", 5.0, "mm")
     cloud: _Replaced = key("what the cloud replaces: nothing, the inner part, everything", "none")
-    core_share: float = key('share of radius and height that `cloud = "core"` replaces', 0.5, gt=0, lt=1)
-    grading: float = key(
-        'thickness of the layers at both ends and of the outermost ring as a share of the mean; 1 with `cloud = "all"`',
-        0.15, gt=0, le=1,
-    )  # fmt: skip
+    core_share: _Fraction = key('share of radius and height that `cloud = "core"` replaces', 0.5)
+    grading: _Share = key('thickness of end layers and outermost ring in mean edges; 1 with `cloud = "all"`', 0.15)
 
 
 class Ellipsoid(Section):
@@ -163,14 +149,9 @@ class Ellipsoid(Section):
     semi_axes: _Sizes = key("semi-axes along x, y, z", unit="mm")
     element_size: _Positive = key("mean edge of a hexahedron", 5.0, "mm")
     cloud: _Replaced = key("what the cloud replaces: nothing, the inner part, everything", "none")
-    core_share: float = key('share of the semi-axes that `cloud = "core"` replaces', 0.5, gt=0, lt=1)
-    grading: float = key(
-        'size of elements beside the edges of patch and fixed as a share of the mean; 1 with `cloud = "all"`',
-        1.0, gt=0, le=1,
-    )  # fmt: skip
-    cavity: Literal["fitted", "moved"] = key(
-        "seed without a cloud: shells around it, or one hexahedron whose nodes move (the paper)", "fitted"
-    )
+    core_share: _Fraction = key('share of the semi-axes that `cloud = "core"` replaces', 0.5)
+    grading: _Share = key('edges at the rims of patch and fixed in mean edges; 1 with `cloud = "all"`', 1.0)
+    cavity: Literal["fitted", "moved"] = key("seed without a cloud: in shells, or one hexahedron (the paper)", "fitted")
 
 
 class MeshFiles(Section):
@@ -180,10 +161,9 @@ class MeshFiles(Section):
     efg: _File | None = key("nodes of the cloud; nodes on the interface may be repeated", None)
     integration_points: _File | None = key("CSV or HDF5 with x, y, z, volume and, if needed, sets", None)
     dropped: _Distinct[str] = key("cell sets of `fe` whose hexahedra the cloud replaces", ())
-    cuts: _Integer = key(
-        "without `integration_points`: parts of a dropped hexahedron along each edge; if none is dropped, the cells "
-        "of `efg` are the integration cells",
-        2, ge=1, le=16,
+    cuts: Annotated[int, Field(ge=1, le=16)] = key(
+        "without `integration_points`: integration cells along each edge of a dropped hexahedron; if none is dropped, "
+        "the cells of `efg` are the integration cells", 2
     )  # fmt: skip
     surface_areas: _File | None = key(
         "CSV of node, x, y, z: the outer surface's share of constant stress at nodes on the cloud's boundary", None
@@ -198,7 +178,7 @@ class MeshFiles(Section):
         "consistent",
     )
     repair: bool = key("reorder the nodes of hexahedra that are numbered inside out or crosswise", False)
-    merge_tolerance: float = key("nodes of both meshes closer than this are one", 0.001, "mm", ge=0)
+    merge_tolerance: _NotNegative = key("nodes of both meshes closer than this are one", 0.001, "mm")
 
 
 class Tumour(Section):
@@ -207,9 +187,7 @@ class Tumour(Section):
     centre: _Vector = key("centre of seed and tumour, in the image's coordinates", unit="mm")
     volume: _Positive = key("volume of the whole sphere at full load", unit="mm3")
     seed_radius: _Positive = key("radius of the sphere at the start", 2.0, "mm")
-    surface_nodes: _Integer = key(
-        "nodes on the seed's surface; with fewer its hull is smaller than the sphere", 800, ge=12
-    )
+    surface_nodes: _Integer = key("nodes on the seed's surface; the fewer, the smaller is their hull", 800, ge=12)
 
 
 class Cloud(Section):
@@ -217,7 +195,7 @@ class Cloud(Section):
 
     radius: _Positive = key("tissue hexahedra this near to the tumour's centre are replaced", 18.0, "mm")
     growth: _Positive = key("node spacing as a share of the distance to the seed's centre", 0.2)
-    spacing: float = key("largest node spacing; 0: the size of a hexahedron", 0.0, "mm", ge=0)
+    spacing: _NotNegative = key("largest node spacing; 0: the size of a hexahedron", 0.0, "mm")
     irregularity: float = key("random shift of nodes as a share of the spacing", 0.3, ge=0, lt=0.5)
     seed: _Integer = key("seed of the random numbers", 0, ge=0)
     points_per_spacing: _Positive = key("integration cells per node spacing, in each direction", 1.1)
@@ -231,21 +209,21 @@ class Support(Section):
     weight: Literal["equal", "quartic"] = key("weight of the moving least squares; the paper: equal", "quartic")
     max_fe_nodes: _Integer = key("largest number of FE nodes in a support domain; the paper: 7", 19, ge=0)
     min_domains: _Count = key("smallest number of support domains that an EFG node is in", 3)
-    stabilisation: float = key("stiffness of modes that the gradient does not see; 0: the paper", 0.1, ge=0)
+    stabilisation: _NotNegative = key("stiffness of modes that the gradient does not see; 0: the paper", 0.1)
     consistency: bool = key("correct gradients so that a constant stress is in balance; false: the paper", True)
 
 
 class Hexahedra(Section):
     """One-point hexahedra."""
 
-    hourglass: float = key("hourglass stiffness, R_hg of the paper", 0.04 / 9, ge=0)
+    hourglass: _NotNegative = key("hourglass stiffness, R_hg of the paper", 0.04 / 9)
     gradient: Literal["mean", "centre"] = key("mean over the volume, or at the centre as in the paper", "mean")
 
 
 class Sphere(Section):
     """Cells whose centre lies in a sphere make the cell set NAME, for a material's `cells`; NAME is free."""
 
-    name: SkipJsonSchema[str] = Field("", alias="[NAME]")
+    name: SkipJsonSchema[str] = Field("", validation_alias="[NAME]")
     centre: _Vector = key("centre of the sphere", unit="mm")
     radius: _Positive = key("radius of the sphere", unit="mm")
 
@@ -253,8 +231,8 @@ class Sphere(Section):
 class MaterialSection(Section):
     """A material and the cells that it fills; NAME is free."""
 
-    name: SkipJsonSchema[str] = Field("", alias="[NAME]")
-    law: Annotated[Law, WithJsonSchema({"enum": list(LAWS), "default": DEFAULT_LAW})] = key("constitutive law")
+    name: SkipJsonSchema[str] = Field("", validation_alias="[NAME]")
+    law: Annotated[InstanceOf[Law], WithJsonSchema({"enum": list(LAWS), "default": DEFAULT_LAW})] = key("constitutive law")
     density: _Positive = key("density", 1000.0, "kg/m3")
     cells: _Distinct[str] = key("names of cell sets; all: cells that no other material names", ("all",), min_length=1)
 
@@ -264,7 +242,7 @@ class MaterialSection(Section):
         """The table of a deck with a law in place of its name and its parameters."""
         if info.context is None or not isinstance(table, dict):
             return table
-        common = {field.alias or name for name, field in cls.model_fields.items()}
+        common = {field.validation_alias or name for name, field in cls.model_fields.items()}
         own = {name: value for name, value in table.items() if name in common}
         law = LAWS.get(str(table.get("law", DEFAULT_LAW)))
         return own | ({"law": law.model_validate({k: v for k, v in table.items() if k not in common})} if law else {})
@@ -286,12 +264,8 @@ class Displaced(Section):
     """Nodes that are moved along the loading curve; any number of these sections."""
 
     nodes: str = key("name of a node set")
-    displacement: tuple[float, ...] | None = key(
-        "displacement at full load, one for each direction", None, "mm", min_length=1
-    )
-    field: _File | None = key(
-        "instead: CSV of x, y, z, ux, uy, uz, points and their displacements, interpolated at the nodes", None
-    )
+    displacement: tuple[float, ...] | None = key("displacement at full load, by direction", None, "mm", min_length=1)
+    field: _File | None = key("instead: CSV of x, y, z, ux, uy, uz, interpolated at the nodes", None)
     field_unit: _Length | None = key("unit of length of `field`; mm unless given", None)
     directions: _Distinct[_Axis] = key("directions that are prescribed; the others stay free", _XYZ, min_length=1)
     rotation: float = key("angle at full load by which the nodes are also rotated", 0.0, "degrees", ge=-360, le=360)
@@ -306,22 +280,16 @@ class Solver(Section):
         "slow loading; damped steps to the static solution; or waves, with the true masses", "dynamic-relaxation"
     )
     load_time: _Positive = key("quasi-static, dynamic: duration of the load", 2.0, "s")
-    hold_time: float = key("quasi-static, dynamic: duration after the load, at full load", 0.0, "s", ge=0)
+    hold_time: _NotNegative = key("quasi-static, dynamic: duration after the load, at full load", 0.0, "s")
     load_steps: Literal["auto"] | _Count = key(
         "dynamic-relaxation: steps of the load; auto: what cells beside moved nodes need, more if one inverts", "auto"
     )
     tolerance: _Positive = key("dynamic-relaxation stops at this distance from the static solution", 0.01, "mm")
-    time_step: Literal["auto"] | _Positive = key(
-        "largest time step; auto: the longest stable step times safety", "auto", "s"
-    )
-    safety: float = key("share of the longest stable step, by power iteration, that is taken", 0.8, gt=0, le=1)
+    time_step: Literal["auto"] | _Positive = key("largest time step; auto: `safety` times the stable step", "auto", "s")
+    safety: _Share = key("share of the longest stable step, by power iteration, that is taken", 0.8)
     mass_scaling: bool = key("quasi-static: raise the mass of nodes for which the step is too long", True)
-    on_inversion: Literal["stop", "recover"] = key(
-        "an unstable run stops, or returns to an earlier state and a stricter step (at most 5 times)", "stop"
-    )
-    precision: Literal["double", "single"] = key(
-        "arithmetic of the cells' forces; nodes always move in double precision", "double"
-    )
+    on_inversion: Literal["stop", "recover"] = key("stop, or restore a state and shorten the step, 5 times", "stop")
+    precision: Literal["double", "single"] = key("precision of the cells' forces; the rest is double", "double")
 
 
 class Output(Section):
@@ -330,9 +298,7 @@ class Output(Section):
     frames: _Count = key("frames over the load, without the undeformed one", 10)
     pictures: bool = key("draw the deformed body", True)
     stress: bool = key("also the Cauchy stress of every cell in every frame, in Pa: xx, yy, zz, xy, yz, xz", False)
-    checkpoint_minutes: float = key(
-        "time between checkpoints, for `run --resume`; 0: only when the run is interrupted", 10.0, "min", ge=0
-    )
+    checkpoint_minutes: _NotNegative = key("time between checkpoints; 0: only of an interrupted run", 10.0, "min")
 
 
 class Partition(Section):
@@ -361,16 +327,16 @@ class Deck(Section):
     solver: Solver = Solver()
     output: Output = Output()
     partition: Partition = Partition()
-    path: SkipJsonSchema[Path] = Field(alias="[path]")  # of the deck, for messages
+    path: SkipJsonSchema[Path] = Field(validation_alias="[path]")  # of the deck, for messages
 
     @property
     def spheres(self) -> tuple[Sphere, ...]:
-        """The spheres in the order of the deck."""
+        """In the order of the deck."""
         return tuple(self.sphere.values())
 
     @property
     def materials(self) -> tuple[MaterialSection, ...]:
-        """The materials in the order of the deck."""
+        """In the order of the deck."""
         return tuple(self.material.values())
 
     @classmethod
