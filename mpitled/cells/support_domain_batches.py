@@ -285,7 +285,7 @@ def check_template(  # type: ignore[no-untyped-def]
 
     Where tensor (6, n_nodes) is given, it receives mass tensors, and required receives nothing. The material stiffness
     of a domain acts in one direction g_a = K B_a at each node: c (sum_a g_a . u_a)^2. By Cauchy's inequality it is at
-    most c (sum_b |g_b|) sum_a (g_a . u_a)^2 / |g_a|. The remaining stiffness is bounded in the same way with |B_a|. Next
+    most c (sum_b |g_b|) sum_a (g_a . u_a)^2 / |g_a|. The remaining stiffness is bounded likewise with |B_a|. Next
     to a grown tumour the first bound is large across the thin layers and small along them.
     """
     n = U(nodes.shape[1])

@@ -233,7 +233,7 @@ def forces_template(u, f, line, length, along, scale, coefficient):  # type: ign
     """Add the nodal forces of runs of equal boxes to f; returns the smallest J of these cells.
 
     line (4, n_runs) and length (n_runs,), uint64: cell w of a run lies between the nodes line + w and line + w + 1 of
-    four grid lines along the axis `along` (n_runs,). Axes and corners are numbered cyclically from that axis; corners 0,
+    four grid lines along the axis `along` (n_runs,). Axes and corners are numbered cyclically from it; corners 0,
     3, 4 and 7 are the near ends on the lines. scale (3, n_runs), 1/m: the gradient of a sign vector, 1 / (4 edge).
     coefficient (n + 1, n_runs): the law's n coefficients times V, J, and the hourglass stiffness k of eq. 4.22, N/m
     (R (lambda + 2 mu) V (B:B) / 8).

@@ -1,4 +1,4 @@
-"""Explicit vectors for the kernels: a vector fills a register of 512 bits and holds one number of each of several cells.
+"""Explicit vectors for the kernels: a vector fills a register of 512 bits with one number of each of several cells.
 
 Numba's vectoriser stores intermediate values between loops to memory and gathers one number at a time. The kernels
 therefore use explicit vectors. On a processor with narrower registers a vector takes several registers. All functions
