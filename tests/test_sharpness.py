@@ -161,7 +161,7 @@ def test_auto_is_never_above_the_limit_and_mostly_near_it(tmp_path):
         deck, sub, figures = subdomain(tmp_path, text, share)
         place = (sub.rows.read("points") @ (STRETCHES[stretch] - np.eye(3)).T).T
         for kind in ("dynamic", "quasi-static", "relaxation"):
-            solver = replace(deck.solver, method=kind)
+            solver = deck.solver.model_copy(update={"method": kind})
             if kind == "relaxation":
                 method = Relaxation(solver, 1, sub, world, None, None)
             else:
@@ -185,7 +185,7 @@ def test_the_limit_is_followed_while_a_tumour_grows(tmp_path, cloud, kind):
     text = ELLIPSOID.format(cloud=cloud) + TISSUE.format(nu=0.49, fixed="surface") + TUMOUR
     deck, sub, figures = subdomain(tmp_path, text.replace("150.0", "600.0"), 0)
     # Slow enough that no cell is crushed on the way: that is a state which no step makes stable.
-    solver, world = replace(deck.solver, method=kind, load_time=0.5, load_steps=300), World()
+    solver, world = deck.solver.model_copy(update={"method": kind, "load_time": 0.5, "load_steps": 300}), World()
     if kind == "quasi-static":
         method = March(solver, 1, sub, world, None, None, figures)
     else:
@@ -226,9 +226,9 @@ def test_the_iteration_leaves_the_forces_of_the_displacements(tmp_path, kind):
         tmp_path, BLOCK.format(size=[30.0] * 3, cloud="core") + TISSUE.format(nu=0.49, fixed="z0"), 0.1
     )
     if kind == "relaxation":
-        method = Relaxation(replace(deck.solver, method=kind), 1, sub, World(), None, None)
+        method = Relaxation(deck.solver.model_copy(update={"method": kind}), 1, sub, World(), None, None)
     else:
-        method = March(replace(deck.solver, method=kind), 1, sub, World(), None, None, figures)
+        method = March(deck.solver.model_copy(update={"method": kind}), 1, sub, World(), None, None, figures)
     method.begin()
     s = method.state
     s.place(np.random.default_rng(0).normal(scale=1e-14, size=(3, sub.n_nodes)))  # m: smaller than what is tried
