@@ -24,8 +24,6 @@ else:
 
 #: A file that is larger, or has a key of more parts, is not a deck; parsers take the square of the time for such keys.
 _MAX_BYTES, _MAX_PARTS = 1 << 18, 100
-#: Larger numbers are mistakes, and smaller ones are zero: ratios of the others and their cubes are finite.
-_LARGEST = 1e30
 _DECIMAL_COMMA = re.compile(r"=\s*[-+]?\d+,\d+\s*(#|$)")
 #: Suffixes of mesh files.
 OF_MESHES = (".inp", ".k", ".key", ".dyn", ".msh", ".vtk", ".vtu", ".med", ".xdmf", ".mesh", ".bdf")
@@ -49,7 +47,7 @@ def load_deck(
     given = [*(("--set", text) for text in overrides), *((place, text) for text in varied)]
     source = _Source(path, {_override(table, text, option): option for option, text in given})
     try:
-        deck = Deck.from_table(_strict(table), path)
+        deck = Deck.from_table(table, path)
     except ValidationError as error:
         raise _refusal(error.errors(include_url=False), table, source) from None
     except RecursionError:
@@ -77,17 +75,6 @@ class _Source(NamedTuple):
         except (RecursionError, ValueError):  # nested without end, or an integer of thousands of digits
             value = ""
         return InputError(" ".join(f"{origin}: {shorten(name)}{value}: {reason}".splitlines()))
-
-
-def _strict(value: Any) -> Any:
-    """A value of TOML with tuples in place of lists, and floats in the range of sizes and moduli."""
-    if isinstance(value, dict):
-        return {name: _strict(inner) for name, inner in value.items()}
-    if isinstance(value, list):
-        return tuple([_strict(inner) for inner in value])
-    if isinstance(value, float) and 0 < abs(value) < 1 / _LARGEST:
-        return 0.0
-    return math.inf if isinstance(value, int | float) and abs(value) > _LARGEST else value
 
 
 def _at(table: Any, way: Sequence[Any]) -> Any:
@@ -162,13 +149,16 @@ def _conflicts(deck: Deck, table: dict[str, Any]) -> Iterator[tuple[tuple[Any, .
         yield (), f"{found}; give exactly one of {', '.join(f'[{name}]' for name in GEOMETRIES)}"
     if not deck.materials and not deck.mesh:
         yield (), "has no material; give at least one [material.NAME]"
-    yield from _repeated({("material", material.name, "cells"): material.cells for material in deck.materials})
+    filled = {("material", material.name, "cells"): material.cells for material in deck.materials}
+    yield from _repeated(filled, "give each set of cells one material")
     if deck.support.nodes < deck.support.basis:
         reason = f"is fewer than the {deck.support.basis} monomials of support.basis; give at least as many"
         yield ("support", "nodes"), reason
     if deck.labels:
-        ventricles = ("left_ventricle", "right_ventricle")
-        yield from _repeated({("labels", name): getattr(deck.labels, name) for name in ("tissue", *ventricles)})
+        labels = {
+            ("labels", name): getattr(deck.labels, name) for name in ("tissue", "left_ventricle", "right_ventricle")
+        }
+        yield from _repeated(labels, "name a label once; one label of both ventricles: labels.right_ventricle = []")
     if deck.tumour:
         radius = table["tumour"]["seed_radius"]
         seed_volume = 4 / 3 * math.pi * radius**3
@@ -194,20 +184,20 @@ def _conflicts(deck: Deck, table: dict[str, Any]) -> Iterator[tuple[tuple[Any, .
             reason = f"does not have one number for {directions}; give {len(moved.directions)}, in mm"
             yield ("displaced", i, "displacement"), reason
         if moved.rotation and set("xyz") - {moved.axis} - set(moved.directions):
-            reason = f"leaves a direction free in which the rotation about {moved.axis} moves nodes; prescribe it too"
+            reason = f"turns nodes about {moved.axis} that are free in a direction across it; prescribe it too"
             yield ("displaced", i, "directions"), reason
     step = deck.solver.time_step
     if step != "auto" and step > deck.solver.load_time:
         yield ("solver", "time_step"), f"is longer than solver.load_time; give less than {deck.solver.load_time:g} s"
 
 
-def _repeated(lists: Mapping[tuple[str, ...], Sequence[Any]]) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Entries that are in two lists, by the parts of the names of their keys."""
+def _repeated(lists: Mapping[tuple[str, ...], Sequence[Any]], remedy: str) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Entries that are in two lists, which are given by the parts of the names of their keys."""
     first: dict[Any, str] = {}
     for way, entries in lists.items():
         for entry in entries:
             if entry in first:
-                yield way, f"{entry} is in {first[entry]} already; keep it in one of the two"
+                yield way, f"{entry} is in {first[entry]} already; {remedy}"
             first[entry] = ".".join(way)
 
 

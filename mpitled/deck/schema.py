@@ -22,6 +22,8 @@ from mpitled.mesh import METRES, Constraint, Rotation
 
 #: Units of the deck that are not SI: how many make one SI unit. Dividing by a power of ten rounds 5.1 mm to 0.0051 m.
 _PER_SI = {"mm": 1e3, "mm3": 1e9, "degrees": 180 / math.pi}
+#: Larger numbers are mistakes, and smaller ones are zero: ratios of the others and their cubes are finite.
+_LARGEST = 1e30
 #: The law of a material that names none.
 DEFAULT_LAW = NeoHookean.name
 #: The sections of which a deck has exactly one.
@@ -41,6 +43,17 @@ def from_si(value: Any, unit: str) -> Any:
         return value
     decimals = (float(f"{value * _PER_SI[unit]:.{digits}g}") for digits in (15, 16, 17))
     return next((decimal for decimal in decimals if to_si(decimal, unit) == value), value * _PER_SI[unit])
+
+
+def _strict(value: Any) -> Any:
+    """A value of TOML with tuples in place of lists, and floats in the range of sizes and moduli."""
+    if isinstance(value, dict):
+        return {name: _strict(inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return tuple([_strict(inner) for inner in value])
+    if isinstance(value, float) and 0 < abs(value) < 1 / _LARGEST:
+        return 0.0
+    return math.inf if isinstance(value, int | float) and abs(value) > _LARGEST else value
 
 
 def key(meaning: str, default: Any = ..., unit: str = "", **limits: Any) -> Any:
@@ -232,7 +245,7 @@ class MaterialSection(Section):
     """A material and the cells that it fills; NAME is free."""
 
     name: SkipJsonSchema[str] = Field("", validation_alias="[NAME]")
-    law: Annotated[InstanceOf[Law], WithJsonSchema({"enum": list(LAWS), "default": DEFAULT_LAW})] = key("constitutive law")
+    law: Annotated[InstanceOf[Law], WithJsonSchema({"enum": list(LAWS), "default": DEFAULT_LAW})] = key("material law")
     density: _Positive = key("density", 1000.0, "kg/m3")
     cells: _Distinct[str] = key("names of cell sets; all: cells that no other material names", ("all",), min_length=1)
 
@@ -341,8 +354,8 @@ class Deck(Section):
 
     @classmethod
     def from_table(cls, table: dict[str, Any], path: Path) -> Deck:
-        """The deck of a TOML table that has tuples in place of lists; pydantic's ValidationError if it is wrong."""
-        return cls.model_validate(table | {"[path]": path}, context=path.parent, by_alias=True, by_name=False)
+        """The deck of a table as TOML has it; pydantic's ValidationError if it is wrong."""
+        return cls.model_validate(_strict(table) | {"[path]": path}, context=path.parent, by_alias=True, by_name=False)
 
     def constraints(self) -> Iterator[Constraint]:
         """The held and the moved nodes, with the key that says so."""
