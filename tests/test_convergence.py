@@ -73,7 +73,7 @@ def error(folder, n, cloud, consistency="true"):
     rows = store.read_part(folder / "model.h5", 1, 0)
     sub = localise(rows, deck.hexahedra.hourglass, deck.support.stabilisation, "mean")
     tolerance = 1e-5 * STRAIN * SIZE
-    relaxation = Relaxation(replace(deck.solver, tolerance=tolerance), 1, sub, World(), None, None)
+    relaxation = Relaxation(deck.solver.model_copy(update={"tolerance": tolerance}), 1, sub, World(), None, None)
     u = relaxed(relaxation)
     u[model.n_fe_nodes :] = np.einsum("na,nai->ni", model.field_shapes, u[model.domains[model.field_domains]])
     free = np.setdiff1d(np.arange(model.n_nodes), surface)

@@ -155,10 +155,9 @@ def _conflicts(deck: Deck, table: dict[str, Any]) -> Iterator[tuple[tuple[Any, .
         reason = f"is fewer than the {deck.support.basis} monomials of support.basis; give at least as many"
         yield ("support", "nodes"), reason
     if deck.labels:
-        labels = {
-            ("labels", name): getattr(deck.labels, name) for name in ("tissue", "left_ventricle", "right_ventricle")
-        }
-        yield from _repeated(labels, "name a label once; one label of both ventricles: labels.right_ventricle = []")
+        names = ("tissue", "left_ventricle", "right_ventricle")
+        remedy = "name a label once; one label of both ventricles: labels.right_ventricle = []"
+        yield from _repeated({("labels", name): getattr(deck.labels, name) for name in names}, remedy)
     if deck.tumour:
         radius = table["tumour"]["seed_radius"]
         seed_volume = 4 / 3 * math.pi * radius**3
@@ -191,7 +190,7 @@ def _conflicts(deck: Deck, table: dict[str, Any]) -> Iterator[tuple[tuple[Any, .
         yield ("solver", "time_step"), f"is longer than solver.load_time; give less than {deck.solver.load_time:g} s"
 
 
-def _repeated(lists: Mapping[tuple[str, ...], Sequence[Any]], remedy: str) -> Iterator[tuple[tuple[str, ...], str]]:
+def _repeated(lists: Mapping[Any, Sequence[Any]], remedy: str) -> Iterator[tuple[tuple[str, ...], str]]:
     """Entries that are in two lists, which are given by the parts of the names of their keys."""
     first: dict[Any, str] = {}
     for way, entries in lists.items():
