@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 import pytest
+from mpitled.solver.step import State, at_rest, compose_forces, compose_march
 from scipy.linalg import eigh
 
 from mpitled import kernels
@@ -14,7 +15,6 @@ from mpitled.material import Material, first_piola, strain_energy
 from mpitled.mesh import CORNERS, grid_points, structured_hexahedra
 from mpitled.parallel.subdomain import DOMAIN_NODE_COST, GATHERED_COST, cell_costs, localise
 from mpitled.solver.stability_check import Survey
-from mpitled.solver.step import State, at_rest, compose_forces, compose_march
 from mpitled.store import PartRows
 
 BRAIN = Material("brain", 3000.0, 0.49, 1000.0)

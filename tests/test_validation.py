@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 from conftest import ROOT, mpitled
+from mpitled.solver.step import at_rest, compose_forces
 from scipy.linalg import eigh
 from scipy.optimize import brentq
 from test_compare import CYLINDER, DATA, SLOPE, synthetic
@@ -18,7 +19,6 @@ from mpitled.material import first_piola
 from mpitled.model import build as model_build
 from mpitled.parallel.subdomain import localise
 from mpitled.results import charts, compare, field
-from mpitled.solver.step import at_rest, compose_forces
 
 CUBE = ROOT / "jobs" / "validation" / "cube.toml"
 #: What the deck of the cube has other than the program's defaults.

@@ -37,27 +37,27 @@ with _cached_by_source():
         add,
         add_gathered,
         change_step,
-        follow,
         gather,
+        hash_random,
         invert_masses,
-        keep_masses,
         kinetic_energy,
+        limit_mass_decrease,
         perturb,
+        power_iteration,
         raise_mass,
-        react,
+        reaction_work,
         relax,
-        respond,
+        relaxation_norms,
+        rotate_prescribed,
         scatter,
-        scramble,
         update,
-        watch_relaxation,
     )  # fmt: skip
 
 PADDING = BATCH_LANES  # the last vector of a run reads beyond the run's nodes, and adds nothing there
 
 __all__ = [
-    "BATCH_LANES", "PADDING", "add", "add_gathered", "change_step", "domain_forces", "domain_survey", "follow",
-    "gather", "hexahedron_forces", "hexahedron_survey", "invert_masses", "keep_masses", "kinetic_energy", "perturb",
-    "raise_mass", "react", "relax", "respond", "scatter", "scramble", "update", "voxel_forces", "voxel_survey",
-    "watch_relaxation",
+    "BATCH_LANES", "PADDING", "add", "add_gathered", "change_step", "domain_forces", "domain_survey", "gather",
+    "hash_random", "hexahedron_forces", "hexahedron_survey", "invert_masses", "kinetic_energy",
+    "limit_mass_decrease", "perturb", "power_iteration", "raise_mass", "reaction_work", "relax", "relaxation_norms",
+    "rotate_prescribed", "scatter", "update", "voxel_forces", "voxel_survey",
 ]  # fmt: skip

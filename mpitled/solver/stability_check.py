@@ -1,4 +1,4 @@
-"""The survey of all cells of a rank every few steps: energies, J, and the mass that a stable step needs."""
+"""The check of all cells every few steps: energies, J, and the nodal masses that a stable step needs."""
 
 from __future__ import annotations
 
@@ -7,18 +7,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import kernels
 from mpitled.parallel.subdomain import Subdomain
-from mpitled.solver.step import State
+from mpitled.terms import State, Term
+from mpitled.terms.term import StabilityBound
 
 
 @dataclass(slots=True)
-class Survey:
-    """Arrays that a survey fills.
-
-    A step is stable where each node's mass is at least dt^2 / 4 times the sum of its cells' largest eigenvalues, for
-    which the kernels give a bound in the present configuration. The same holds for mass tensors and tensors of bounds.
-    """
+class StabilityCheck:
+    """Collects the shares of all terms in the stability bound, see `StabilityBound`, and their figures."""
 
     sub: Subdomain
     jacobian: NDArray[np.float32] = field(init=False)  # (n_cells + 1,), the last for lanes without a cell
@@ -28,46 +24,19 @@ class Survey:
         self.jacobian = np.ones(self.sub.n_cells + 1, np.float32)
         self.required = np.zeros((1, self.sub.n_nodes))
 
-    def look(self, s: State, safety: float, tensor: NDArray[np.float64] | None = None) -> dict[str, float]:
-        """Energies (J) of this rank's cells by kind, and the smallest J of all steps so far.
+    def evaluate(
+        self, s: State, terms: tuple[Term, ...], safety: float, tensor: NDArray[np.float64] | None = None
+    ) -> dict[str, float]:
+        """This rank's figures of the terms, and "min_jacobian", the smallest J of all steps so far.
 
-        Fills `jacobian` with the cells' J and `required` with the mass that keeps the step `safety` below the bound,
-        without the shares of other ranks. Where tensor (6, n_nodes) is given, what support domains ask goes there.
+        Fills `jacobian`, and `required` with the masses that keep the step at `safety` times the bound, without the
+        shares of other ranks. Support domains add to tensor (6, n_nodes) instead where it is given.
         """
-        sub, required, jacobian = self.sub, self.required[0], self.jacobian
-        required[:] = 0
-        factor = (s.time_step / (2 * safety)) ** 2
-        strain = hourglass = stabilisation = 0.0
-        if (r := sub.runs) is not None:
-            strain, hourglass = kernels.voxel_survey(
-                s.seen,
-                r.line,
-                r.length,
-                r.along,
-                r.first_cell,
-                r.scale,
-                r.coefficient,
-                r.gram,
-                required,
-                factor,
-                jacobian,
-            )
-        if (h := sub.hexahedra) is not None:
-            more, resisted = kernels.hexahedron_survey(
-                s.seen, h.nodes, h.cells, h.geometry, h.coefficient, h.gram, h.stiffness, required, factor, jacobian
-            )
-            strain += more
-            hourglass += resisted
-        if (d := sub.domains) is not None:
-            more, stabilisation = kernels.domain_survey(
-                s.seen, d.nodes, d.cells, d.gradient, d.position, d.inverse, d.coefficient, d.gram, d.stiffness,
-                required, factor, jacobian, tensor,
-            )  # fmt: skip
-            strain += more
-        s.smallest_jacobian = min(s.smallest_jacobian, float(jacobian[:-1].min()))
-        return {
-            "strain": strain,
-            "hourglass": hourglass,
-            "stabilisation": stabilisation,
-            "min_jacobian": s.smallest_jacobian,
-        }
+        self.required[:] = 0
+        bound = StabilityBound((s.time_step / (2 * safety)) ** 2, self.required[0], self.jacobian, tensor)
+        found: dict[str, float] = {}
+        for term in terms:
+            for name, value in term.check(s, bound).items():
+                found[name] = found.get(name, 0.0) + value
+        s.smallest_jacobian = min(s.smallest_jacobian, float(self.jacobian[:-1].min()))
+        return found | {"min_jacobian": s.smallest_jacobian}
