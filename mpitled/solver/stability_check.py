@@ -34,9 +34,9 @@ class StabilityCheck:
         """
         self.required[:] = 0
         bound = StabilityBound((s.time_step / (2 * safety)) ** 2, self.required[0], self.jacobian, tensor)
-        found: dict[str, float] = {}
+        found = dict.fromkeys((figure.name for term in terms for figure in term.figures), 0.0)
         for term in terms:
             for name, value in term.check(s, bound).items():
-                found[name] = found.get(name, 0.0) + value
+                found[name] += value
         s.smallest_jacobian = min(s.smallest_jacobian, float(self.jacobian[:-1].min()))
         return found | {"min_jacobian": s.smallest_jacobian}
