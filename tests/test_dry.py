@@ -15,7 +15,7 @@ from mpitled.errors import InputError
 from mpitled.job import prepare, run
 from mpitled.parallel.halo import World
 from mpitled.preview.dry_run import left_out, reasons
-from mpitled.speed.witness import kernel_names
+from mpitled.preview.kernel_trace import kernel_names
 from mpitled.store import open_result
 
 SCENE = (

@@ -19,8 +19,8 @@ from mpitled.errors import everywhere
 from mpitled.parallel.halo import World
 from mpitled.parallel.subdomain import SHORTEST_RUN, Subdomain
 from mpitled.preview import forecast
+from mpitled.preview.kernel_trace import Call, distinct_bytes, trace_kernels
 from mpitled.solver.central_difference import March
-from mpitled.speed.witness import Call, distinct_bytes, witness
 
 
 def dry_run(deck: Deck, directory: Path, world: World, *, verbose: bool = False) -> str:
@@ -35,7 +35,7 @@ def dry_run(deck: Deck, directory: Path, world: World, *, verbose: bool = False)
         run.method.begin()
     method, sub = run.method, run.sub
     terms = [(name, partial(act, method.state)) for name, act in (*method.forces, *method.motion)]
-    calls, surveyed = witness(terms), witness([("survey", method.look)])
+    calls, surveyed = trace_kernels(terms), trace_kernels([("survey", method.look)])
     seconds, survey = forecast.measure(method)
     step = sum(seconds.values())
     counts = [sub.rows.n_own_hexahedra, sub.rows.n_own_domains, sub.n_nodes, sum(len(nodes) for _, nodes in sub.shared)]
@@ -119,7 +119,7 @@ def left_out(directory: Path, metadata: Mapping[str, Any]) -> list[str]:
     """What the run in a directory, whose result records this of it, did without on rank 0, as `dry_run` tells it."""
     deck, ranks = decks.recorded(metadata["deck"], directory), metadata["ranks"]
     sub, method = forecast.first_rank(deck, directory / job.MODEL, ranks)
-    return _left_out(deck, sub, ranks, witness([("all", method.warm_up)]))
+    return _left_out(deck, sub, ranks, trace_kernels([("all", method.warm_up)]))
 
 
 def _left_out(deck: Deck, sub: Subdomain, ranks: int, calls: Sequence[Call]) -> list[str]:
