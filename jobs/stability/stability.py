@@ -1,18 +1,23 @@
-"""The stability matrix: scenes taken to extremes; each is right, stops with a reason, was warned of, or is wrong.
+"""The stability matrix: scenes taken to extremes; each is right, stops with a reason, is warned of, or is wrong.
 
-A run is right if its displacements differ from the reference by no more than TRUE_TO times what is known of it: its own
-distance to the static solution (or the tolerance to which that is found, if it is more), that of a reference that is a
-run too, and the error with which the cells interpolate a reference that is a closed form, which is none but for the
-shell. Without a closed form the reference is the same mesh relaxed to a hundredth of the tolerance with four times the
-load steps. Waves are compared with themselves at a quarter of the step of "auto": of the second order, as the central
-difference is, their error is as many times that of a run at half that step as the squares of the steps say.
+python jobs/stability/stability.py [--out out/stability] [--only AXIS,...] [--keep]   some 13 minutes on one core
+
+Writes stability.csv and stability.png; --keep copies both to jobs/studies. Completed runs are not repeated. Exit status
+1 if a case is wrong.
+
+A run is right if its displacements differ from the reference by at most FACTOR times the known error: its own distance
+to the static solution (at least its tolerance), the distance of a reference that is a run, and the interpolation error
+of the cells for a closed form (which is zero except for the shell). Where there is no closed form, the reference is the
+same mesh, relaxed to a hundredth of the tolerance with four times the load steps. Waves are compared with a run at a
+quarter of the time step of "auto". The error of the central difference is of second order: it follows from the
+difference to a third run at half the time step.
 """
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import json
-import os
 import re
 import shutil
 import sys
@@ -22,101 +27,132 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from exact import CLOSED_FORMS
+from extremes import AXES, KINDS, METHODS, Axis
+from grid import write_grid
 from numpy.typing import NDArray
+from picture import draw
 
 from mpitled import atomic, store
 from mpitled.batch import launch
-from mpitled.batch.exact import CLOSED_FORMS
-from mpitled.batch.extremes import AXES, KINDS, METHODS, Axis, write_grid
 from mpitled.cells import hexahedra
-from mpitled.errors import InputError, MpitledError
+from mpitled.errors import MpitledError
 from mpitled.material import strain_energy
 from mpitled.model import Model
 
-#: Warned: the field is not that of the reference, but the mesh was warned of when it was read, or the result when it
-#: was there. Buckled: it is not that of a closed form which the mesh has exactly, but it holds less energy: the closed
-#: form is no stable equilibrium.
+#: Warned: the field is not the reference's, but the mesh or the result has a warning. Buckled: the field is not that of
+#: an exact closed form, but it has less energy: the closed form is no stable equilibrium.
 OUTCOMES = RIGHT, STOPPED, WARNED, BUCKLED, WRONG = "completed", "stopped", "warned", "buckled", "wrong"
 COLUMNS = (
     "axis", "about", "value", "kind", "method", "outcome", "status", "error_mm", "allowed_mm", "reference",
     "static_distance_mm", "balance_error", "kinetic_ratio", "min_jacobian", "steps", "loop_s", "message",
 )  # fmt: skip
-#: Estimates are true to this factor.
-TRUE_TO = 3.0
+#: Estimates of errors are correct within this factor.
+FACTOR = 3.0
 #: Errors below this share of the body's size are round-off of some thousand steps.
 ROUND_OFF = 1e-9
-#: s of computing, after which a run hangs: most take seconds, those whose load is begun anew a minute.
-HANGS = 300
-#: What makes the references that are runs.
-_OTHERWISE = {
+#: Limit of processor time, s. Most runs take seconds, those that restart their load a minute.
+TIME_LIMIT = 300
+SAFETY = 0.8
+#: Overrides of the runs that are references, and of the run that tells the critical time step.
+OTHER_RUNS = {
     "relaxed": ("solver.method=dynamic-relaxation", "solver.tolerance=1e-4", "solver.load_steps=2000"),
     "quarter": ("solver.method=dynamic", "solver.time_step=0.2*critical"),
     "half": ("solver.method=dynamic", "solver.time_step=0.4*critical"),
+    "critical": (
+        "solver.method=dynamic", f"solver.safety={SAFETY}", "solver.time_step=auto", "displaced.0.displacement=[1e-6]",
+    ),
+}  # fmt: skip
+#: By exit status, the message of a run that stopped: it names the cell or the key (or the file), and a remedy.
+EXPLAINED = {
+    2: re.compile(r"(\w+\.\w+( = [^:]+)?|\.inp: line \d+): .+[;,] "),
+    3: re.compile(
+        r"(hexahedron|support domain) \d+ \(.+\) at \(.+\) mm on rank \d+ .*; .*(solver|cloud)\.\w+"
+        r"|; give solver\.\w+ = "
+    ),
 }
-#: A run that takes the critical step times SAFETY. Whole surveys fill the load time, which takes 1 % of it at most.
-SAFETY = 0.8
-_CRITICAL = (
-    "solver.method=dynamic", f"solver.safety={SAFETY}", "solver.time_step=auto", "displaced.0.displacement=[1e-6]"
-)  # fmt: skip
-#: A stop names the cell or the key (or the file), and what to do.
-_UNSTABLE = re.compile(
-    r"(hexahedron|support domain) \d+ \(.+\) at \(.+\) mm on rank \d+ .*; .*(solver|cloud)\.\w+|; give solver\.\w+ = "
-)
-_REFUSED = re.compile(r"(\w+\.\w+( = [^:]+)?|\.inp: line \d+): .+[;,] ")
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One cell of the matrix."""
+    """One cell of the matrix, and its runs, which are computed only once."""
 
-    name: str  # the axis, a key of AXES
+    name: str  # of the axis
     axis: Axis
     value: str
     kind: str
     method: str
+    out: Path
 
     @property
     def words(self) -> list[str]:
-        """What `--set` takes, shares of the critical step not yet worked out, and words of the grid."""
-        words = [*self.axis.values[self.value].split(), *KINDS[self.axis.geometry][self.kind].split()]
-        return [word for word in words if not word.startswith("reference.")]
+        """The words of the value and the kind of cells."""
+        return [*self.axis.values[self.value].split(), *KINDS[self.axis.geometry][self.kind].split()]
 
     @property
-    def reference_words(self) -> list[str]:
-        """What `--set` takes besides for the run that is the reference."""
+    def deck(self) -> Path:
+        """The deck, in a folder of the value."""
+        return self.out / f"{self.name}-{_plain(self.value)}" / "scene.toml"
+
+    def write_deck(self) -> None:
+        """Write the deck and the mesh that it reads; delete runs of another deck."""
+        folder, text = self.deck.parent, f'title = "{self.axis.about}"\n{self.axis.deck}'
+        if self.deck.exists() and self.deck.read_text() == text:
+            return
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        if self.axis.geometry == "mesh":
+            grid = [word.removeprefix("grid.").split("=", 1) for word in self.words if word.startswith("grid.")]
+            write_grid(folder, dict(grid))
+        self.deck.write_text(text)
+
+    def run(self, name: str, *more: str) -> tuple[Path, str]:
+        """The folder of a run with more overrides, and the reason of its failure ("" if it is done)."""
+        words = [word for word in self.words if not word.startswith(("grid.", "reference."))]
+        overrides = [*{word.partition("=")[0]: word for word in (*words, *more)}.values()]  # the last of each key
+        digest = hashlib.sha256(json.dumps(overrides).encode()).hexdigest()[:8]
+        folder = self.deck.parent / f"{self.kind}-{_plain(name)}-{digest}"
+        failure = launch.outcome(folder)
+        if failure is None:
+            print(f"  {name}", file=sys.stderr, flush=True)
+            overrides.sort(key=lambda word: word.endswith("*critical"))
+            overrides = [self._in_seconds(word) if word.endswith("*critical") else word for word in overrides]
+            failure = launch.run_apart(self.deck, overrides, 1, folder, TIME_LIMIT)
+        return folder, failure
+
+    def reference_run(self, name: str) -> Path:
+        """The folder of a run that is a reference. MpitledError if it failed."""
         words = self.axis.values[self.value].split()
-        return [f"solver.{word.removeprefix('reference.')}" for word in words if word.startswith("reference.")]
+        more = [f"solver.{word.removeprefix('reference.')}" for word in words if word.startswith("reference.")]
+        folder, failure = self.run(name, *OTHER_RUNS[name], *(more if name != "critical" else ()))
+        if failure:
+            raise MpitledError(f"there is no run {name}: {failure}")
+        return folder
+
+    def _in_seconds(self, word: str) -> str:
+        key, share = word.removesuffix("*critical").split("=")
+        return f"{key}={float(share) * _report(self.reference_run('critical'))['time_step_s'] / SAFETY:.9g}"
 
 
-def cases(only: Sequence[str] = ()) -> Iterator[Case]:
-    """All cells of the matrix, or those of some axes. InputError if there is no such axis."""
-    for name in only:
-        if name not in AXES:
-            raise InputError(f"--only {name}: there is no such axis; axes are {', '.join(AXES)}")
+def cases(out: Path, only: Sequence[str] = ()) -> Iterator[Case]:
+    """All cases of the matrix, or those of some axes."""
     for name in only or AXES:
         axis = AXES[name]
         for value in axis.values:
             for kind in axis.kinds:
                 for method in axis.methods:
-                    yield Case(name, axis, value, kind, method)
+                    yield Case(name, axis, value, kind, method, out)
 
 
 def matrix(out: Path, only: Sequence[str] = ()) -> list[dict[str, Any]]:
-    """Run what has not been run yet, one after the other, and judge all of it: stability.csv and stability.png."""
-    todo = list(cases(only))
+    """Run the cases that have not been run yet, judge all of them, and write stability.csv and stability.png."""
     rows = []
-    for i, case in enumerate(todo, 1):
-        folder = out / f"{case.name}-{_plain(case.value)}"
-        deck = _write_deck(folder, case)
-        run = _Runs(deck, case, f"{i}/{len(todo)}")
-        rows.append(_judge(case, run))
+    for case in cases(out, only):
+        print(f"{case.name} {case.value}, {case.kind}, {case.method}", file=sys.stderr, flush=True)
+        case.write_deck()
+        rows.append(_judge(case))
     atomic.write_csv(out / "stability.csv", COLUMNS, rows)
-    try:
-        from mpitled.results import charts
-    except ImportError:
-        print(f"{out}: no picture, for matplotlib is missing", file=sys.stderr)
-    else:
-        charts.draw_matrix(rows, out / "stability.png")
+    draw(rows, out / "stability.png")
     return rows
 
 
@@ -124,107 +160,58 @@ def _plain(text: str) -> str:
     return "".join(c if c.isalnum() or c in "._-" else "_" for c in text)
 
 
-def _write_deck(folder: Path, case: Case) -> Path:
-    """The deck of an axis in the folder of a value, and the mesh it reads; what was run with another is thrown away."""
-    deck, wanted = folder / "scene.toml", f'title = "{case.axis.about}"\n{case.axis.deck}'
-    if deck.exists() and deck.read_text() != wanted:
-        shutil.rmtree(folder)
-    if not deck.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        if case.axis.geometry == "mesh":
-            grid = [word.removeprefix("grid.") for word in case.words if word.startswith("grid.")]
-            write_grid(folder, dict(word.split("=", 1) for word in grid))
-        deck.write_text(wanted)
-    return deck
-
-
-class _Runs:
-    """The runs of a case: its own, and those it is compared with."""
-
-    def __init__(self, deck: Path, case: Case, label: str) -> None:
-        self.deck, self.case, self.label = deck, case, label
-
-    def run(self, name: str, *words: str) -> tuple[Path, str]:
-        """The folder of a run under that name, and the reason of its failure; it is run unless it has been."""
-        case = self.case
-        last = {word.partition("=")[0]: word for word in (*case.words, *words)}
-        every = [word for key, word in last.items() if not key.startswith("grid.")]
-        digest = hashlib.sha256(json.dumps(every).encode()).hexdigest()[:8]
-        folder = self.deck.parent / f"{case.kind}-{_plain(name)}-{digest}"
-        if (failure := launch.outcome(folder)) is None:
-            print(f"{self.label}: {case.name} {case.value}, {case.kind}, {name}", file=sys.stderr, flush=True)
-            failure = launch.run_apart(self.deck, self._worked_out(every), 1, folder, HANGS)
-        return folder, failure
-
-    def _worked_out(self, words: list[str]) -> list[str]:
-        """The words with shares of the critical step as seconds: that of the undeformed body, as the program has it."""
-        shares = [word for word in words if word.endswith("*critical")]
-        done = [word for word in words if word not in shares]
-        for word in shares:
-            key, share = word.removesuffix("*critical").split("=")
-            folder, failure = self.run("critical", *_CRITICAL)
-            if failure:
-                raise MpitledError(f"there is no critical step: {failure}")
-            critical = _figures(folder)["time_step_s"] / SAFETY
-            done.append(f"{key}={float(share) * critical:.9g}")
-        return done
-
-
-def _judge(case: Case, runs: _Runs) -> dict[str, Any]:
-    """A row of the table: what became of the case."""
+def _judge(case: Case) -> dict[str, Any]:
+    """A row of the table."""
     row: dict[str, Any] = dict.fromkeys(COLUMNS, "") | {
         "axis": case.name, "about": case.axis.about, "value": case.value, "kind": case.kind, "method": case.method,
         "reference": case.axis.reference, "outcome": WRONG,
     }  # fmt: skip
     try:
-        folder, failure = runs.run(case.method, *METHODS[case.method].split())
+        folder, failure = case.run(case.method, *METHODS[case.method].split())
+        row |= {"status": int(launch.about(folder)["status"]), "message": failure.replace(f"{case.deck.parent}/", "")}
+        if failure:
+            pattern = EXPLAINED.get(row["status"])
+            return row | ({"outcome": STOPPED} if pattern and pattern.search(failure) else {})
+        report = _report(folder)
+        row |= {
+            "static_distance_mm": report.get("static_distance_mm", ""),
+            "balance_error": report["energy_J"]["balance_error"],
+            "kinetic_ratio": report["kinetic_to_internal"]["largest_after_10_percent"],
+            "min_jacobian": report["min_jacobian"],
+            "steps": report["steps"],
+            "loop_s": report["seconds"]["loop"],
+        }
+        return row | _compare(case, folder, report)
     except MpitledError as problem:
         return row | {"message": str(problem)}
-    status = int(launch.about(folder)["status"])
-    row |= {"status": status, "message": failure.replace(f"{runs.deck.parent}{os.sep}", "")}
-    if status:
-        explained = {2: _REFUSED, 3: _UNSTABLE}.get(status)
-        row["outcome"] = STOPPED if explained and explained.search(failure) else WRONG
-        return row
-    report = _figures(folder)
-    row |= {
-        "static_distance_mm": report.get("static_distance_mm", ""),
-        "balance_error": report["energy_J"]["balance_error"],
-        "kinetic_ratio": report["kinetic_to_internal"]["largest_after_10_percent"],
-        "min_jacobian": report["min_jacobian"],
-        "steps": report["steps"],
-        "loop_s": report["seconds"]["loop"],
-    }
-    try:
-        reference, allowed = _reference(case, runs, folder)
-    except MpitledError as problem:
-        return row | {"message": str(problem)}
-    own = report.get("static_distance_mm")
+
+
+def _compare(case: Case, folder: Path, report: dict[str, Any]) -> dict[str, Any]:
+    """The columns of a completed run that depend on the reference."""
     model, field, tolerance = _field(folder)
-    warnings = report["warnings"]
-    if own is None and case.method != "waves":
-        if warnings:
-            return row | {"outcome": WARNED, "message": " | ".join(warnings)}
-        return row | {"message": "does not say how far from the static solution it ended"}
+    reference, allowed = _reference(case, model, folder)
+    distance, warnings = report.get("static_distance_mm"), report["warnings"]
+    warned = {"outcome": WARNED, "message": " | ".join(warnings)}
+    if distance is None and case.method != "waves":
+        return warned if warnings else {"message": "does not say how far from the static solution it ended"}
     round_off = ROUND_OFF * 1e3 * float(np.ptp(model.points, axis=0).max())
     exact = case.axis.reference in CLOSED_FORMS and allowed < round_off
-    if own is not None:
-        allowed += max(own, tolerance)
-    allowed = TRUE_TO * allowed + round_off
+    allowed = FACTOR * (allowed + (0.0 if distance is None else max(distance, tolerance))) + round_off
     error = 1e3 * float(np.abs(field - reference).max())
-    row |= {"error_mm": error, "allowed_mm": allowed}
+    errors = {"error_mm": error, "allowed_mm": allowed}
     if error <= allowed:
-        return row | {"outcome": RIGHT}
+        return errors | {"outcome": RIGHT}
     if warnings:
-        return row | {"outcome": WARNED, "message": " | ".join(warnings)}
-    if exact and (energy := _energy(model, reference)) > report["energy_J"]["internal"]:
-        words = f"holds {report['energy_J']['internal']:.3g} J, less than the closed form with {energy:.3g} J"
-        return row | {"outcome": BUCKLED, "message": words}
-    return row | {"message": "the field is farther from the reference than it may be"}
+        return errors | warned
+    energy = report["energy_J"]["internal"]
+    if exact and (closed := _energy(model, reference)) > energy:
+        message = f"has {energy:.3g} J, less than the closed form with {closed:.3g} J"
+        return errors | {"outcome": BUCKLED, "message": message}
+    return errors | {"message": "the field is farther from the reference than allowed"}
 
 
 def _energy(model: Model, displacement: NDArray[np.float64]) -> float:
-    """The strain energy (J) of nodal displacements (n_nodes, 3), m, without hourglass and stabilisation."""
+    """The strain energy, J, of nodal displacements (n_nodes, 3), m, without hourglass control and stabilisation."""
     gradients, volumes = hexahedra.geometry(model.points, model.hexahedra)
     X = np.eye(3) + np.concatenate(
         [
@@ -240,66 +227,79 @@ def _energy(model: Model, displacement: NDArray[np.float64]) -> float:
     return energy
 
 
-def _reference(case: Case, runs: _Runs, folder: Path) -> tuple[NDArray[np.float64], float]:
-    """Displacements (n_nodes, 3), m, that the run's are compared with, and how far they may be wrong themselves, mm."""
+def _reference(case: Case, model: Model, folder: Path) -> tuple[NDArray[np.float64], float]:
+    """Displacements (n_nodes, 3), m, that those of the run in a folder are compared with, and their own error, mm."""
     name = case.axis.reference
-    if name in CLOSED_FORMS:
+    if form := CLOSED_FORMS.get(name):
         with store.open_result(folder) as result:
             tumour = result.metadata["deck"].get("tumour")
-        model, volume = store.read_model(folder / "model.h5"), 1e-9 * tumour["volume"] if tumour else 0.0
-        exact = CLOSED_FORMS[name](model, model.points, volume)
+        volume = 1e-9 * tumour["volume"] if tumour else 0.0
+        exact = form(model, model.points, volume)
         at = np.concatenate([model.points[model.hexahedra].mean(axis=1), model.domain_points])
         at_domains = np.einsum("ga,gai->gi", model.domain_shapes, exact[model.domains])
         interpolated = np.concatenate([exact[model.hexahedra].mean(axis=1), at_domains])
-        return exact, 1e3 * float(np.abs(interpolated - CLOSED_FORMS[name](model, at, volume)).max())
-    fields, steps, distance = [], [_figures(folder).get("time_step_s", np.nan)], 0.0
-    for other in (name, "half") if name == "quarter" else (name,):
-        found, failure = runs.run(other, *_OTHERWISE[other], *case.reference_words)
-        if failure:
-            raise MpitledError(f"there is no reference: {failure}")
-        figures = _figures(found)
-        fields.append(_field(found)[1])
-        steps.append(figures.get("time_step_s", np.nan))
-        distance = figures.get("static_distance_mm", 0.0)
-    if name == "quarter":
-        own, quarter, half = (step**2 for step in steps)
-        distance = 1e3 * float(np.abs(fields[1] - fields[0]).max()) * (own - quarter) / (half - quarter)
-    return fields[0], distance
+        return exact, 1e3 * float(np.abs(interpolated - form(model, at, volume)).max())
+    other = case.reference_run(name)
+    reference = _field(other)[1]
+    if name != "quarter":
+        return reference, _report(other).get("static_distance_mm", 0.0)
+    half = case.reference_run("half")
+    own2, quarter2, half2 = (_report(each)["time_step_s"] ** 2 for each in (folder, other, half))
+    difference = 1e3 * float(np.abs(_field(half)[1] - reference).max())
+    return reference, difference * (own2 - quarter2) / (half2 - quarter2)
 
 
-def _figures(folder: Path) -> dict[str, Any]:
-    return dict(json.loads((folder / "report.json").read_text()))
+def _report(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "report.json").read_text())
 
 
 def _field(folder: Path) -> tuple[Model, NDArray[np.float64], float]:
-    """The model of a run, the displacement field (n_nodes, 3), m, at its end, and its tolerance, mm."""
+    """The model of a run, its last displacements (n_nodes, 3), m, and its tolerance, mm."""
     with store.open_result(folder) as result:
         tolerance = float(result.metadata["deck"]["solver"]["tolerance"])
         return store.read_model(folder / "model.h5"), result.at_nodes("displacement", -1), tolerance
 
 
 def summary(rows: list[dict[str, Any]]) -> str:
-    """The outcomes by axis in Markdown, then every wrong one."""
+    """The outcomes by axis as Markdown, then every wrong case."""
     lines = [
-        f"| axis | cells | {' | '.join(OUTCOMES)} | largest error, mm | of what it may be | smallest J |",
+        f"| axis | cases | {' | '.join(OUTCOMES)} | largest error, mm | share of allowed | smallest J |",
         "|" + (5 + len(OUTCOMES)) * "---|",
     ]
-    names = list(dict.fromkeys(row["axis"] for row in rows))
-    for name in (*names, "all"):
+    for name in (*dict.fromkeys(row["axis"] for row in rows), "all"):
         own = [row for row in rows if name in (row["axis"], "all")]
-        counts = [sum(row["outcome"] == outcome for row in own) for outcome in OUTCOMES]
+        counts = [str(sum(row["outcome"] == outcome for row in own)) for outcome in OUTCOMES]
         done = [row for row in own if row["outcome"] == RIGHT]
-        worst = max(done, key=lambda row: float(row["error_mm"]) / float(row["allowed_mm"]), default=None)
         numbers = ["", "", ""]
-        if worst:
-            numbers = [
-                f"{max(float(row['error_mm']) for row in done):.2g}",
-                f"{float(worst['error_mm']) / float(worst['allowed_mm']):.0%}",
-                f"{min(float(row['min_jacobian']) for row in done):.2g}",
-            ]
-        lines.append(f"| {name} | {len(own)} | {' | '.join(map(str, counts))} | {' | '.join(numbers)} |")
+        if done:
+            share = max(row["error_mm"] / row["allowed_mm"] for row in done)
+            error, smallest = max(row["error_mm"] for row in done), min(row["min_jacobian"] for row in done)
+            numbers = [f"{error:.2g}", f"{share:.0%}", f"{smallest:.2g}"]
+        lines.append(f"| {' | '.join([name, str(len(own)), *counts, *numbers])} |")
     for row in rows:
         if row["outcome"] == WRONG:
-            place = f"{row['axis']} {row['value']}, {row['kind']}, {row['method']}"
-            lines.append(f"\nwrong: {place}: {row['message']}; error {row['error_mm']} mm of {row['allowed_mm']}")
+            case = f"{row['axis']} {row['value']}, {row['kind']}, {row['method']}"
+            lines.append(f"\nwrong: {case}: {row['message']}; error {row['error_mm']} mm of {row['allowed_mm']}")
     return "\n".join(lines)
+
+
+def main() -> int:
+    """Exit status 1 if a case is wrong."""
+    parser = argparse.ArgumentParser(description="Scenes taken to extremes: which complete, and which stop.")
+    parser.add_argument("--out", type=Path, default=Path("out/stability"), metavar="DIR", help="folder of the runs")
+    parser.add_argument("--only", default="", metavar="AXIS,...", help=f"some of the axes: {', '.join(AXES)}")
+    parser.add_argument("--keep", action="store_true", help="copy the table and the picture to jobs/studies")
+    options = parser.parse_args()
+    only = [name for name in options.only.split(",") if name]
+    if unknown := set(only) - AXES.keys():
+        parser.error(f"--only: there is no axis {', '.join(unknown)}; axes are {', '.join(AXES)}")
+    rows = matrix(options.out, only)
+    print(summary(rows))
+    if options.keep:
+        for name in ("stability.csv", "stability.png"):
+            shutil.copy(options.out / name, Path(__file__).parents[1] / "studies" / name)
+    return int(any(row["outcome"] == WRONG for row in rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
