@@ -68,7 +68,7 @@ EXPLAINED = {
     2: re.compile(r"(\w+\.\w+( = [^:]+)?|\.inp: line \d+): .+[;,] "),
     3: re.compile(
         r"(hexahedron|support domain) \d+ \(.+\) at \(.+\) mm on rank \d+ .*; .*(solver|cloud)\.\w+"
-        r"|; give solver\.\w+ = "
+        r"|comes no nearer to the static solution .*; .*solver\.\w+"
     ),
 }
 
