@@ -17,7 +17,7 @@ from mpitled.deck import Deck
 from mpitled.errors import everywhere
 from mpitled.parallel.halo import World
 from mpitled.preview import forecast
-from mpitled.speed.witness import Call, distinct_bytes, witness
+from mpitled.preview.kernel_trace import Call, distinct_bytes, trace_kernels
 from mpitled.terms.term import Method
 
 
@@ -33,7 +33,7 @@ def dry_run(deck: Deck, directory: Path, world: World, *, verbose: bool = False)
         run.integrator.begin()
     method, sub = run.integrator, run.sub
     terms = [(term.name, partial(term.apply, method.state)) for term in method.step.terms]
-    calls, surveyed = witness(terms), witness([("check", method.check)])
+    calls, surveyed = trace_kernels(terms), trace_kernels([("check", method.check)])
     seconds, survey = forecast.measure(method)
     step = sum(seconds.values())
     counts = [sub.rows.n_own_hexahedra, sub.rows.n_own_domains, sub.n_nodes, sum(len(nodes) for _, nodes in sub.shared)]
