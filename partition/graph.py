@@ -146,10 +146,10 @@ def _sorted_face(nodes, first, corners, face):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def _equal(a, b):  # type: ignore[no-untyped-def]
     """Whether two arrays have the same entries; np.all would allocate a third."""
+    same = True
     for i in range(len(a)):
-        if a[i] != b[i]:
-            return False
-    return True
+        same &= a[i] == b[i]
+    return same
 
 
 @njit(cache=True)

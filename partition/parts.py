@@ -171,9 +171,7 @@ def figures(
         crossing = np.repeat(part, np.diff(graph.xadj))
         cut = np.bincount(crossing[crossing != part[graph.adjncy]], minlength=tables.n_parts)
     return PartFigures(
-        cells_of={
-            name: np.bincount(own, minlength=tables.n_parts) for name, own in zip(sizes, of_blocks, strict=True)
-        },
+        cells_of={name: np.bincount(own, minlength=tables.n_parts) for name, own in zip(sizes, of_blocks, strict=True)},
         cost=np.bincount(part, costs, tables.n_parts).astype(np.float64, copy=False),
         nodes=np.diff(tables.node_offsets),
         halo_nodes=np.bincount(of_node[n_touching[tables.nodes] > 1], minlength=tables.n_parts),

@@ -12,8 +12,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from mpitled.mesh import grid_points, structured_hexahedra
 from mpitled.cells.kind import HEXAHEDRA
+from mpitled.mesh import grid_points, structured_hexahedra
 from partition import Block, CellGraph, PartTables, cell_graph, cut, figures, tables
 
 COSTS = (1.0, 1.3)  # of a hexahedron and of a support domain

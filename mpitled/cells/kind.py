@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 from mpitled.cells import hexahedra
 
 #: (gradients (n, k, 3), 1/m; volumes (n,), m^3) from node positions (n_nodes, 3), m; cells (n, k); the gradient rule.
-Geometry = Callable[
-    [NDArray[np.float64], NDArray[np.integer], str], tuple[NDArray[np.float64], NDArray[np.float64]]
-]
+Geometry = Callable[[NDArray[np.float64], NDArray[np.integer], str], tuple[NDArray[np.float64], NDArray[np.float64]]]
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from mpitled.kernels.stress import cofactor, inline, kernel
 
 @njit(cache=True)
 def follow(path, full, turns, amplitude):  # type: ignore[no-untyped-def]
-    """Displacements (n,), m, of dofs at that share of the load on the arcs of `loading.turn`; exact at full load."""
+    """Displacements (n,), m, of dofs at that share of the load on their rotation paths; exact at full load."""
     for p in range(path.size):
         angle, arm, across = turns[p, 0], turns[p, 1], turns[p, 2]
         arc = (np.cos(amplitude * angle) - 1) * arm + np.sin(amplitude * angle) * across

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -10,18 +11,16 @@ from numpy.typing import NDArray
 
 from mpitled.cells import hexahedra
 from mpitled.cells import support_domains as support
+from mpitled.cells.kind import KINDS
 from mpitled.kernels import BATCH_LANES
 from mpitled.kernels.lanes import BITS
 from mpitled.material import hourglass_modulus
 from mpitled.mesh import CORNERS
-from mpitled.store import BLOCK, PartRows
+from mpitled.model import CellBlock, empty_block
+from mpitled.store import CHUNK_ROWS, PartRows
 
 #: Boxes in a row shorter than this are gathered: a run keeps a whole vector of lanes busy.
 SHORTEST_RUN = 4
-#: Costs in a step of relaxation, in those of a box in a run with its node: of a hexahedron that is gathered, and of
-#: each node of a support domain. A march asks 0.40 for that, single precision 0.26.
-GATHERED_COST = 3.8
-DOMAIN_NODE_COST = 0.36
 #: Edges of a box agree this well relative to their length: the round-off of coordinates far from the origin.
 BOX_TOLERANCE = 1e-11
 #: What `solver.precision` means for the cells' arithmetic.
@@ -82,13 +81,15 @@ class DomainBatches:
 class Subdomain:
     """The part of the model on one rank, in local numbers and SI units.
 
-    A cell lives on exactly one rank. A node lives on every rank whose cells touch it; all of them move it alike, and
-    its owner alone writes it and counts it in sums. Local cells are hexahedra first, then support domains.
+    A cell is on exactly one rank. A node is on every rank with a cell that touches it; all of these ranks move it
+    identically, and its owner alone writes it and counts it in sums. Local cells are numbered block after block. The
+    cells of all blocks of a kind are packed together.
     """
 
     rows: PartRows
     domain_nodes: NDArray[np.uint32]  # (n_domains, n)
     domain_shapes: NDArray[np.float64]  # (n_domains, n), at their integration points
+    field_domains: NDArray[np.uint32]  # (n_field_nodes, n), nodes of the domain that gives the field at an EFG node
     n_nodes: int
     n_cells: int
     runs: VoxelRuns | None
@@ -97,7 +98,7 @@ class Subdomain:
     fixed: NDArray[np.uint32]  # dofs (3 node + direction) that stay where they are
     moving: NDArray[np.uint32]  # dofs that follow the loading curve
     moving_full: NDArray[np.float64]  # (len(moving),), m at full load
-    moving_turns: NDArray[np.float64] | None  # (len(moving), 3), see `loading.turn`; None where all move straight
+    moving_turns: NDArray[np.float64] | None  # (len(moving), 3), see `loading.rotation_path`; None: all straight
     shared: tuple[tuple[int, NDArray[np.uint32]], ...]  # (rank, nodes shared with it), ranks ascending
     precision: type[np.floating]  # of the cells' arithmetic
 
@@ -126,15 +127,15 @@ class Subdomain:
         speed.reshape(-1)[self.moving] = velocity
         moves: NDArray[np.bool_] = np.any(speed, axis=1)
         steepest = 0.0
-        for kind in ("hexahedra", "domains"):
-            for first, nodes in rows.blocks(kind):
+        for block in rows.blocks:
+            for first, nodes in block.chunks("nodes"):
                 cells = rows.local(nodes)
                 near = moves[cells].any(axis=1)
                 if near.any():
-                    if kind == "hexahedra":
-                        gradients = hexahedra.geometry(points, cells[near])[0]
+                    if block.kind.geometry:
+                        gradients = block.gradients(points, cells[near], 0)
                     else:
-                        gradients = rows.read("domain_gradients", first, first + len(nodes))[near]
+                        gradients = block.gradients(points, cells, first)[near]
                     found = np.einsum("cai,caj->cij", speed[cells[near]], gradients)
                     steepest = max(steepest, float(np.sqrt((found**2).sum(axis=(1, 2)).max())))
         return steepest
@@ -153,39 +154,52 @@ def localise(
     def local(nodes: NDArray[np.int64]) -> NDArray[np.uint32]:
         return rows.local(nodes).astype(np.uint32, copy=False)
 
-    n_hexahedra, points, material = rows.n_own_hexahedra, rows.read("points"), rows.read("material")
+    points, solid, cloud = rows.read("points"), _Cells(rows, "hexahedra"), _Cells(rows, "support domains")
     lame = np.array([[m.mu, m.lam] for m in rows.materials]).T  # (2, n_materials)
-    cells = np.empty((n_hexahedra, 8), np.uint32)
-    for start, nodes in rows.blocks("hexahedra"):
+    cells = np.empty((len(solid), 8), np.uint32)
+    for start, nodes in solid.chunks("nodes"):
         cells[start : start + len(nodes)] = local(nodes)
-    found = _find_runs(points, cells, material[:n_hexahedra])
+    of_solid, of_cloud = solid.read("material"), cloud.read("material")
+    found = _find_runs(points, cells, of_solid, solid.starts)
     general = np.flatnonzero(~found.in_runs)
-    domains = local(rows.read("domains"))
+    domains, field_block = local(cloud.read("nodes")), [b for b in rows.blocks if b.name == rows.field_block]
+    giving = [local(block.read("nodes"))[rows.field_domains] for block in field_block] or [domains]
     shared = np.zeros(len(rows.nodes), bool)
     shared[local(rows.shared)] = True
     dofs = 3 * local(rows.prescribed_dofs // 3) + (rows.prescribed_dofs % 3).astype(np.uint32)
-    turns = rows.prescribed_turns.any(axis=1)
+    turns = rows.rotation_paths.any(axis=1)
     moves = (rows.prescribed_displacements != 0) | turns
     return Subdomain(
         rows=rows,
         domain_nodes=domains,
-        domain_shapes=rows.read("domain_shapes"),
+        domain_shapes=cloud.read("shapes"),
+        field_domains=giving[0],
         n_nodes=len(rows.nodes),
         n_cells=rows.n_own_cells,
-        runs=_in(precision, _voxel_runs(found, lame[:, material[found.first]], hourglass, shared)),
+        runs=_in(precision, _voxel_runs(found, lame[:, of_solid[found.first]], hourglass, shared, solid.numbers)),
         hexahedra=_in(
             precision,
             _hexahedron_batches(
-                points, cells, general, lame[:, material[general]], rows.n_own_cells, hourglass, rule, precision, shared
+                points,
+                cells,
+                general,
+                lame[:, of_solid[general]],
+                rows.n_own_cells,
+                hourglass,
+                rule,
+                precision,
+                shared,
+                solid.numbers(general),
             ),
         ),
         domains=_in(
-            precision, _domain_batches(rows, points, domains, lame[:, material[n_hexahedra:]], stabilisation, shared)
+            precision,
+            _domain_batches(rows, cloud, points, domains, lame[:, of_cloud], stabilisation, shared),
         ),
         fixed=dofs[~moves],
         moving=dofs[moves],
         moving_full=rows.prescribed_displacements[moves],
-        moving_turns=rows.prescribed_turns[moves] if turns.any() else None,
+        moving_turns=rows.rotation_paths[moves] if turns.any() else None,
         shared=tuple(
             (int(rank), local(rows.shared[first:last]))
             for rank, first, last in zip(
@@ -196,13 +210,46 @@ def localise(
     )
 
 
-def cell_costs(
-    points: NDArray[np.float64], hexahedra: NDArray[np.int64], domains: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """What each cell of a model costs in a step, (n_cells,): see `GATHERED_COST`."""
-    in_runs = _find_runs(points, hexahedra, np.zeros(len(hexahedra), np.int16)).in_runs
-    of_domain = DOMAIN_NODE_COST * domains.shape[1]
-    return np.concatenate([np.where(in_runs, 1.0, GATHERED_COST), np.full(len(domains), of_domain)])
+class _Cells:
+    """The own cells of all blocks of a kind, one after another."""
+
+    def __init__(self, rows: PartRows, kind: str) -> None:
+        self.kind, self.blocks = kind, rows.of_kind(kind)
+        blocks = self.blocks
+        self.starts = np.cumsum([0, *(block.n_own for block in blocks)])  # (n_blocks + 1,), the first row of each block
+        # A block's cells are consecutive in the local numbers.
+        self._shift = np.array([block.first_own for block in blocks], np.int64) - self.starts[:-1]
+
+    def __len__(self) -> int:
+        return int(self.starts[-1])
+
+    def numbers(self, rows: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+        """Local cell numbers of rows; of all rows if there is no argument."""
+        if rows is None:
+            return np.arange(len(self)) + np.repeat(self._shift, np.diff(self.starts))
+        return rows + self._shift[np.searchsorted(self.starts, rows, side="right") - 1] if len(rows) else rows
+
+    def read(self, name: str) -> NDArray[Any]:
+        """A column of all these cells. Blocks of different numbers of nodes per cell cannot be packed together."""
+        if not self.blocks:
+            empty = empty_block(KINDS[self.kind])
+            return empty.columns[name] if name in empty.columns else np.asarray(getattr(empty, name))
+        return np.concatenate([block.read(name) for block in self.blocks])
+
+    def chunks(self, name: str) -> Iterator[tuple[int, NDArray[Any]]]:
+        """A column in pieces, each with its first row."""
+        for start, block in zip(self.starts.tolist(), self.blocks, strict=False):
+            for first, values in block.chunks(name):
+                yield start + first, values
+
+
+def cell_costs(points: NDArray[np.float64], blocks: Sequence[CellBlock]) -> NDArray[np.float64]:
+    """Cost (n_cells,) of each cell of a model in a step, relative to a box in a voxel run."""
+    costs = [np.full(len(block), block.kind.node_cost * block.nodes.shape[1]) for block in blocks]
+    for block, of_block in zip(blocks, costs, strict=True):
+        if block.kind.name == "hexahedra":
+            of_block[_find_runs(points, block.nodes, np.zeros(len(block), np.int16)).in_runs] = 1.0
+    return np.concatenate(costs)
 
 
 def _in(precision: type[np.floating], cells: Any) -> Any:
@@ -251,21 +298,27 @@ class _Runs:
     edges: NDArray[np.float64]  # (n_runs, 3), m
 
 
-def _find_runs(points: NDArray[np.float64], cells: NDArray[np.integer], material: NDArray[np.int16]) -> _Runs:
-    """Block by block, so that what is known of each cell takes no room."""
+def _find_runs(
+    points: NDArray[np.float64],
+    cells: NDArray[np.integer],
+    material: NDArray[np.int16],
+    starts: NDArray[np.int64] | None = None,
+) -> _Runs:
+    """In pieces, so that temporary arrays stay small. A run ends where a block of the model does (starts)."""
     n = len(cells)
     good, breaks = np.zeros(n, bool), [np.zeros(min(n, 1), np.int64)]
-    for start in range(0, n, BLOCK):
-        some = cells[max(0, start - 1) : start + BLOCK]  # and the cell before, which the first may follow
+    ends = np.empty(0, np.int64) if starts is None else starts[1:-1]
+    for start in range(0, n, CHUNK_ROWS):
+        some = cells[max(0, start - 1) : start + CHUNK_ROWS]  # and the cell before, which the first may follow
         box, edges = _boxes(points, some)
         box &= _along(some) >= 0
         follows = (some[1:].astype(np.int64) - some[:-1] == 1).all(axis=1) & box[1:] & box[:-1]
-        of = material[max(0, start - 1) : start + BLOCK]
+        of = material[max(0, start - 1) : start + CHUNK_ROWS]
         follows &= of[1:] == of[:-1]
         follows &= (np.abs(edges[1:] - edges[:-1]) <= BOX_TOLERANCE * edges[1:]).all(axis=1)
         breaks.append(max(0, start - 1) + 1 + np.flatnonzero(~follows))
-        good[max(0, start - 1) : start + BLOCK] = box
-    first = np.concatenate(breaks)
+        good[max(0, start - 1) : start + CHUNK_ROWS] = box
+    first = np.unique(np.concatenate([*breaks, ends[ends < n]])) if len(ends) else np.concatenate(breaks)
     length = np.diff([*first, n]) if n else np.zeros(0, np.int64)
     runs = good[first] & (length >= SHORTEST_RUN)
     in_runs = np.repeat(runs, length)
@@ -276,7 +329,11 @@ def _find_runs(points: NDArray[np.float64], cells: NDArray[np.integer], material
 
 
 def _voxel_runs(
-    found: _Runs, lame: NDArray[np.float64], hourglass: float, shared: NDArray[np.bool_]
+    found: _Runs,
+    lame: NDArray[np.float64],
+    hourglass: float,
+    shared: NDArray[np.bool_],
+    numbers: Callable[[NDArray[np.int64]], NDArray[np.int64]],
 ) -> VoxelRuns | None:
     if len(found.first) == 0:
         return None
@@ -293,7 +350,7 @@ def _voxel_runs(
         line=np.ascontiguousarray(near.T, dtype=np.uint64),
         length=length.astype(np.uint64),
         along=axis.astype(np.uint64),
-        first_cell=first.astype(np.uint64),
+        first_cell=numbers(first).astype(np.uint64),
         scale=1 / (4 * edge),
         coefficient=np.stack(
             [mu * volume, lam * volume, hourglass * hourglass_modulus(lam, mu) * volume * gram.sum(axis=0) / 8]
@@ -313,6 +370,7 @@ def _hexahedron_batches(
     rule: str,
     precision: type[np.floating],
     shared: NDArray[np.bool_],
+    numbers: NDArray[np.int64],
 ) -> HexahedronBatches | None:
     if len(chosen) == 0:
         return None
@@ -329,7 +387,7 @@ def _hexahedron_batches(
         shared,
         nodes=lanes,
         in_row=_in_row(lanes, BITS // 8 // precision().itemsize),
-        cells=_lanes(chosen[:, None].astype(np.uint32), n_cells)[:, 0],
+        cells=_lanes(numbers[:, None].astype(np.uint32), n_cells)[:, 0],
         geometry=_lanes(geometry),
         coefficient=_lanes(np.stack([mu * volumes, lam * volumes, k], axis=1), 0),
         gram=_lanes(_symmetric(np.einsum("eai,eaj->eij", gradients, gradients))),
@@ -357,6 +415,7 @@ def _in_row(nodes: NDArray[np.uint32], width: int) -> NDArray[np.bool_]:
 
 def _domain_batches(
     rows: PartRows,
+    cloud: _Cells,
     points: NDArray[np.float64],
     nodes: NDArray[np.uint32],
     lame: NDArray[np.float64],
@@ -367,10 +426,10 @@ def _domain_batches(
         return None
     position, inverse = support.linear_projector(points[nodes])
     mu, lam = lame
-    volume, gradients = rows.read("domain_volumes"), rows.read("domain_gradients")
+    volume, gradients = cloud.read("volumes"), cloud.read("gradients")
     kappa = support.stabilisation_stiffness(inverse, volume, lam + 2 * mu, stabilisation)
     gram = np.einsum("gai,gaj->gij", gradients, gradients)
-    numbers = np.arange(rows.n_own_hexahedra, rows.n_own_cells, dtype=np.uint32)
+    numbers = cloud.numbers().astype(np.uint32)
     stabilised = stabilisation > 0
     return _border_first(
         DomainBatches,

@@ -38,7 +38,12 @@ def dry_run(deck: Deck, directory: Path, world: World, *, verbose: bool = False)
     calls, surveyed = witness(terms), witness([("survey", method.look)])
     seconds, survey = forecast.measure(method)
     step = sum(seconds.values())
-    counts = [sub.rows.n_own_hexahedra, sub.rows.n_own_domains, sub.n_nodes, sum(len(nodes) for _, nodes in sub.shared)]
+    counts = [
+        sub.rows.n_own("hexahedra"),
+        sub.rows.n_own("support domains"),
+        sub.n_nodes,
+        sum(len(nodes) for _, nodes in sub.shared),
+    ]
     sizes = [distinct_bytes(calls) / sub.n_cells, _held_bytes(method) / sub.n_cells]
     table = world.gather([*counts, *sizes, 1e3 * step, 1e3 * survey])
     lines = _forecast(run, table[:, -2].max() / 1e3, table[:, -1].max() / 1e3)
@@ -143,7 +148,7 @@ def _left_out(deck: Deck, sub: Subdomain, ranks: int, calls: Sequence[Call]) -> 
 def reasons(deck: Deck, sub: Subdomain, ranks: int) -> dict[str, str]:
     """Why each kernel is not called, if it is not; "" where it may yet be, later in the run."""
     relaxes = deck.solver.method == "dynamic-relaxation"
-    hexahedra = "no hexahedra" if sub.rows.n_own_hexahedra == 0 else ""
+    hexahedra = "no hexahedra" if sub.rows.n_own("hexahedra") == 0 else ""
     voxels = hexahedra or f"no {SHORTEST_RUN} equal boxes in a row"
     general = hexahedra or f"all hexahedra are boxes, {SHORTEST_RUN} or more in a row"
     domains = "no support domains"
@@ -236,5 +241,5 @@ def _forecast(run: Any, step: float, survey: float) -> list[str]:
         f"steps: {expected.steps}{length}, {expected.surveys} surveys{more}",
         f"loop: {least}{expected.loop_s:.3g} s on the slowest rank ({1e3 * step:.3g} ms a step, "
         f"{1e3 * survey:.3g} ms a survey: the fastest of {forecast.CALLS} calls on this machine)",
-        f"output: {resources.told(run.output_bytes)} in {run.deck.output.frames + 1} frames",
+        f"output: {resources.format_bytes(run.output_bytes)} in {run.deck.output.frames + 1} frames",
     ]

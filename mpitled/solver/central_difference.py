@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from copy import copy
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from mpitled import kernels
 from mpitled.deck import Solver
 from mpitled.errors import InputError
+from mpitled.model import ModelFigures
 from mpitled.parallel.halo import Halo, World
 from mpitled.parallel.subdomain import Subdomain
 from mpitled.solver.restart import Kept
@@ -54,13 +54,13 @@ class March:
         world: World,
         force_halo: Halo | None,
         halo: Halo | None,
-        model: dict[str, Any],
+        model: ModelFigures,
     ) -> None:
         """halo sums one component; model: figures of the preprocessor."""
         self.sub, self.world, self.halo, self.solver, self.safety = sub, world, halo, solver, solver.safety
         self.recovers = solver.on_inversion == "recover"
         self.scales_mass = solver.mass_scaling and solver.method == "quasi-static"
-        self.typical = model["critical_step_typical_s"]  # by the bound
+        self.typical = model.critical_step_typical_s  # by the bound
         self.end = solver.load_time + solver.hold_time
         self.frames, self.frame_span = frames, self.end / frames
         self.frame = 0

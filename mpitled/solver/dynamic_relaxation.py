@@ -91,7 +91,7 @@ class Relaxation:
     @staticmethod
     def components(sub: Subdomain) -> int:
         """Numbers of a node's mass: a tensor's, if there is a support domain in the model, else one."""
-        return 6 if sub.rows.n_domains else 1
+        return 6 if any(block.kind.meshfree for block in sub.rows.blocks) else 1
 
     def _load_steps(self, given: Literal["auto"] | int, world: World) -> float:
         """Steps in which the load grows. Collective.

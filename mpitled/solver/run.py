@@ -19,6 +19,7 @@ from mpitled import deck as decks
 from mpitled import resources, store
 from mpitled.deck import Deck
 from mpitled.errors import InputError, InterruptedRun, MpitledError, UnstableError, everywhere
+from mpitled.model import ModelFigures
 from mpitled.model.loading import sphere_radius
 from mpitled.parallel.halo import Halo, World
 from mpitled.parallel.subdomain import Subdomain
@@ -57,7 +58,7 @@ class Run:
         directory: Path,
         world: World,
         sub: Subdomain,
-        model: dict[str, float],
+        model: ModelFigures,
         phases: Phases,
         quiet: bool,
         about: dict[str, Any],
@@ -78,7 +79,7 @@ class Run:
         self.about, self.found, self.interrupts = about, found, Interrupts(world)
         self.term_seconds: dict[str, float] = {}
         self.distance = math.nan
-        self.volume = model["volume_m3"]
+        self.volume = model.volume_m3
         self.watch = self._watch()
         self.recoveries, self.looks = 0, 0
         self.frames, self.written = 0, -math.inf  # how many, and the time of the last
@@ -427,7 +428,7 @@ class Run:
         sub, u = self.sub, self.method.state.u[:, : self.sub.n_nodes]
         at_points = np.einsum("ga,cga->gc", sub.domain_shapes, u[:, sub.domain_nodes])
         displacement = field = self._owned(u)
-        if sub.rows.n_domains:
+        if any(block.kind.meshfree for block in sub.rows.blocks):
             field = np.concatenate([self._owned(self._field(u)), at_points])
             displacement = np.concatenate([displacement, at_points])
         of_cells: dict[str, NDArray[np.floating]] = {"J": self.method.survey.jacobian[:-1]}
@@ -451,9 +452,9 @@ class Run:
         """u_h (3, n_nodes), m: the parameters of EFG nodes are not the field; one domain's MLS gives it there."""
         rows = self.sub.rows
         field = np.where(rows.owned & (rows.nodes < rows.n_fe_nodes), u, 0.0)
-        domains = rows.read("cells", rows.n_own_hexahedra) - rows.n_hexahedra
-        giving = self.sub.domain_nodes[np.searchsorted(domains, rows.field_domains)]
-        field[:, rows.local(rows.field_nodes)] = np.einsum("ga,cga->cg", rows.field_shapes, u[:, giving])
+        field[:, rows.local(rows.field_nodes)] = np.einsum(
+            "ga,cga->cg", rows.field_shapes, u[:, self.sub.field_domains]
+        )
         if self.force_halo is not None:
             self.force_halo.sum(field)
         return field
@@ -467,8 +468,8 @@ class Run:
         )
         table = world.gather(
             [
-                rows.n_own_hexahedra,
-                rows.n_own_domains,
+                rows.n_own("hexahedra"),
+                rows.n_own("support domains"),
                 halo_seconds / max(loop_seconds, 1e-9),
                 computing,
                 resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,

@@ -104,9 +104,11 @@ def main() -> None:
 
 def _count(path: Path, stabilisation: float) -> dict[str, float]:
     rows = store.read_part(path, 1, 0)
-    whole = rows.n_own_domains // BATCH_LANES * BATCH_LANES  # lanes that fill the last batch are no work of cells
-    n_hexahedra = rows.n_own_hexahedra
-    sub = localise(replace(rows, n_own_domains=whole), HOURGLASS, stabilisation, "mean")
+    domains = rows.n_own("support domains")
+    whole = domains // BATCH_LANES * BATCH_LANES  # lanes that fill the last batch are no work of cells
+    n_hexahedra = rows.n_own("hexahedra")
+    blocks = tuple(replace(b, n_own=whole) if b.kind.meshfree else b for b in rows.blocks)
+    sub = localise(replace(rows, blocks=blocks), HOURGLASS, stabilisation, "mean")
     in_runs = int(sub.runs.length.sum()) if sub.runs else 0
     work = {"voxel hexahedra": in_runs, "hexahedra": n_hexahedra - in_runs, "support domains": whole}
     sub, state = (with_values(part, _to_counting) for part in (sub, at_rest(sub, 1.0, 1e-6)))

@@ -36,11 +36,11 @@ class Scene:
 
 
 def _one_material(scene: Scene) -> Scene:
-    return replace(scene, rows=scene.rows.holding(material=np.zeros(scene.rows.n_own_cells, np.int16)))
+    return replace(scene, rows=scene.rows.with_columns(material=np.zeros(scene.rows.n_own_cells, np.int16)))
 
 
 def _straight(scene: Scene) -> Scene:
-    return replace(scene, rows=replace(scene.rows, prescribed_turns=np.zeros_like(scene.rows.prescribed_turns)))
+    return replace(scene, rows=replace(scene.rows, rotation_paths=np.zeros_like(scene.rows.rotation_paths)))
 
 
 def _fixed(scene: Scene) -> Scene:
@@ -50,7 +50,7 @@ def _fixed(scene: Scene) -> Scene:
 
 #: What is left out, and how; each alone, then all.
 OMISSIONS: dict[str, Callable[[Scene], Scene]] = {
-    "cells that are no boxes": lambda s: replace(s, rows=s.rows.holding(points=s.boxes.read("points"))),
+    "cells that are no boxes": lambda s: replace(s, rows=s.rows.with_columns(points=s.boxes.read("points"))),
     "hourglass control": lambda s: replace(s, hourglass=0.0),
     "stabilisation": lambda s: replace(s, stabilisation=0.0),
     "several materials": _one_material,
@@ -73,7 +73,10 @@ def measure(quick: bool) -> str:
     points = boxes.read("points")
     sheared = points + 1e-3 * points[:, [2, 0, 1]]
     everything = Scene(
-        replace(boxes.holding(points=sheared), prescribed_turns=turns), boxes, told["hourglass"], told["stabilisation"]
+        replace(boxes.with_columns(points=sheared), rotation_paths=turns),
+        boxes,
+        told["hourglass"],
+        told["stabilisation"],
     )
     scenes = {"": everything} | {name: leave_out(everything) for name, leave_out in OMISSIONS.items()}
     least = everything

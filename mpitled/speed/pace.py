@@ -52,7 +52,7 @@ class Pace:
 
     def work(self) -> dict[str, int]:
         """Cells that the terms of forces have to do."""
-        n_hexahedra = self.sub.rows.n_own_hexahedra
+        n_hexahedra = self.sub.rows.n_own("hexahedra")
         in_runs = int(self.sub.runs.length.sum()) if self.sub.runs else 0
         return {
             "voxel hexahedra": in_runs,

@@ -13,14 +13,18 @@ from numpy.typing import NDArray
 
 import partition
 from mpitled import atomic, store
+from mpitled.cells.kind import SUPPORT_DOMAINS
 from mpitled.errors import InputError
-from mpitled.parallel.subdomain import DOMAIN_NODE_COST, cell_costs
+from mpitled.parallel.subdomain import cell_costs
 
 COLUMNS = (
     "parts", "cells_mean", "cells_largest", "balance", "halo_nodes_mean", "halo_nodes_largest", "neighbours_mean",
     "neighbours_largest", "sent_kB_largest", "compute_us", "latency_us", "transfer_us", "fixed_us", "step_us",
     "efficiency", "efficiency_overlapped",
 )  # fmt: skip
+
+
+_DOMAIN_COST = SUPPORT_DOMAINS.node_cost
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +39,7 @@ class Cluster:
     def assumptions(self) -> str:
         """All of them in two lines."""
         return (
-            f"{self.rate / 1e6:g} M boxes a second a core (a support domain's node costs {DOMAIN_NODE_COST:g}), "
+            f"{self.rate / 1e6:g} M boxes a second a core (a support domain's node costs {_DOMAIN_COST:g}), "
             f"{1e6 * self.fixed:g} us a step whatever the size,\n{1e6 * self.latency:g} us a message, "
             f"{self.bandwidth / 1e9:g} GB/s a rank; no contention in the network, no noise; the slowest rank counts"
         )
@@ -46,10 +50,12 @@ def predict(path: Path, counts: Sequence[int], cluster: Cluster, out: Path, seed
 
     The model is not changed. InputError if it has fewer cells than parts.
     """
-    hexahedra, domains, places = store.read_cells(path)
-    costs = cell_costs(store.read_points(path), hexahedra, domains)
-    _say(f"{len(hexahedra)} hexahedra, {len(domains)} support domains: graph")
-    graph = partition.cell_graph(hexahedra, domains, places)
+    cells = store.read_blocks(path)
+    costs = cell_costs(store.read_points(path), cells)
+    _say(f"{', '.join(f'{len(block)} {block.name}' for block in cells)}: graph")
+    blocks = [partition.Block(block.nodes, block.kind.faces, block.columns.get("points")) for block in cells]
+    sizes = {block.name: len(block) for block in cells}
+    graph = partition.cell_graph(blocks)
     rows: list[dict[str, Any]] = []
     finer: tuple[int, NDArray[np.int32]] | None = None
     for n_parts in sorted(set(counts), reverse=True):
@@ -61,8 +67,8 @@ def predict(path: Path, counts: Sequence[int], cluster: Cluster, out: Path, seed
                 raise InputError(f"{path}: {error}") from None
         _say(f"{n_parts} parts: figures")
         # METIS bisects: each of its earlier parts is what the finer parts in a row make up.
-        tables = partition.tables(hexahedra, domains, finer[1] // (finer[0] // n_parts), n_parts)
-        rows.insert(0, step_time(partition.figures(tables, costs, len(hexahedra)), cluster))
+        tables = partition.tables(blocks, finer[1] // (finer[0] // n_parts), n_parts)
+        rows.insert(0, step_time(partition.figures(tables, costs, sizes), cluster))
     atomic.make_folder(out)
     written = [{k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows]
     atomic.write_csv(out / "predict.csv", COLUMNS, written)
@@ -71,7 +77,7 @@ def predict(path: Path, counts: Sequence[int], cluster: Cluster, out: Path, seed
     except ImportError:
         _say(f"{out}: no picture, for matplotlib is missing")
     else:
-        n_cells = len(hexahedra) + len(domains)
+        n_cells = len(costs)
         path = out / "predict.png"
         with atomic.writing(path):
             charts.draw_prediction(rows, f"{n_cells / 1e6:.3g} M cells", cluster.assumptions(), path)
