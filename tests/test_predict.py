@@ -10,6 +10,7 @@ import pytest
 from conftest import complaint, mpitled
 
 import partition
+from mpitled.cells.kind import HEXAHEDRA
 from mpitled.mesh import structured_hexahedra
 from mpitled.speed.predict import COLUMNS, Cluster, step_time
 
@@ -29,9 +30,10 @@ def test_a_steps_time_is_that_of_the_slowest_rank():
     """A bar of 6 x 2 x 2 hexahedra, cut by hand in 1, 2 and 3 layers: 9 nodes between neighbours."""
     hexahedra = structured_hexahedra((6, 2, 2))
     part = np.array([0, 1, 1, 2, 2, 2], np.int32)[np.arange(24) % 6]
-    tables = partition.tables(hexahedra, np.empty((0, 12), np.int64), part, 3)
+    tables = partition.tables([partition.Block(hexahedra)], part, 3)
     row = step_time(
-        partition.figures(tables, np.ones(24), 24), Cluster(latency=5e-6, bandwidth=1e9, rate=1e6, fixed=2e-6)
+        partition.figures(tables, np.ones(24), {"hexahedra": 24}),
+        Cluster(latency=5e-6, bandwidth=1e9, rate=1e6, fixed=2e-6),
     )
     # Ranks have 4, 8, 12 cells, a us each, and 1, 2, 1 neighbours.
     transfer = 9 * 24 / 1e9 * 1e6
@@ -55,12 +57,12 @@ def test_every_number_of_parts_is_cut_as_metis_cuts_it(tmp_path):
     assert [int(row["parts"]) for row in rows] == [3, 4, 8, 16]
     assert told.stderr.count("METIS") == 2  # 8 and 4 lie on the way to 16
     assert (tmp_path / "p" / "predict.png").stat().st_size > 10_000
-    hexahedra, none = structured_hexahedra((24, 24, 24)), np.empty((0, 12), np.int64)
-    graph = partition.cell_graph(hexahedra, none, np.empty((0, 3)))
+    blocks = [partition.Block(structured_hexahedra((24, 24, 24)), HEXAHEDRA.faces)]
+    graph = partition.cell_graph(blocks)
     for row in rows:
         n = int(row["parts"])
         part = partition.cut(graph, n, np.ones(24**3))
-        direct = partition.figures(partition.tables(hexahedra, none, part, n), np.ones(24**3), len(hexahedra))
+        direct = partition.figures(partition.tables(blocks, part, n), np.ones(24**3), {"hexahedra": 24**3})
         assert float(row["balance"]) == pytest.approx(direct.balance, abs=0.005)
         assert float(row["halo_nodes_mean"]) == pytest.approx(direct.halo_nodes.mean(), rel=0.1)  # another chance
 

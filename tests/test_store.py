@@ -17,13 +17,12 @@ from parallel_store import N_FRAMES, frame, write
 
 import partition
 from mpitled import store
+from mpitled.cells.kind import HEXAHEDRA, SUPPORT_DOMAINS
 from mpitled.errors import InputError
 from mpitled.material import Material
 from mpitled.mesh import grid_points, structured_hexahedra
-from mpitled.cells.kind import HEXAHEDRA, SUPPORT_DOMAINS
 from mpitled.model import CellBlock, Model, ModelFigures
 from mpitled.store import files
-
 
 CLOUD_COLUMNS = {"points": (3,), "volumes": (), "gradients": (8, 3), "shapes": (8,)}
 
@@ -76,7 +75,9 @@ def random_parts(model: Model, n_parts: int) -> NDArray[np.int32]:
 
 
 def add_partition(path: Path, model: Model, parts: NDArray[np.int32], n_parts: int) -> None:
-    store.write_partition(path, partition.tables([partition.Block(block.nodes) for block in model.blocks], parts, n_parts))
+    store.write_partition(
+        path, partition.tables([partition.Block(block.nodes) for block in model.blocks], parts, n_parts)
+    )
 
 
 def same(a: object, b: object) -> bool:
@@ -185,7 +186,9 @@ def test_parts_are_the_rows_of_the_model(tmp_path: Path, n_parts: int) -> None:
         for name, column in {"nodes": model.domains, **model.blocks[1].columns}.items():
             assert same(cloud.read(name), column[domains]), name
         local = np.arange(rows.n_own_cells)
-        assert [solid.first_own + k if b is solid else cloud.first_own + k for b, k in map(rows.find_cell, local)] == [*local]
+        assert [solid.first_own + k if b is solid else cloud.first_own + k for b, k in map(rows.find_cell, local)] == [
+            *local
+        ]
         shares = np.split(rows.shared, rows.shared_offsets[1:-1]) if len(rows.neighbours) else []
         for q, nodes in zip(rows.neighbours, shares, strict=True):
             assert same(nodes, np.intersect1d(rows.nodes, read[q].nodes).astype(np.int64))

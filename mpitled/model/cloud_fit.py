@@ -25,7 +25,7 @@ def find_domains(deck: Deck, mesh: Mesh, material: NDArray[np.int16]) -> tuple[N
     limits, coupled = _limits(deck, mesh)
     names = ("domains_limited", "memberships_added", "domains_repaired", "domains_across")
     figures = dict.fromkeys(names, 0)
-    domains = np.empty((len(at), options.nodes), np.int64)
+    of_parts = []
     for part in _parts(mesh):
         own = np.unique(material[n_hexahedra + part.integration_points])
         in_part = np.zeros(mesh.n_nodes, bool)
@@ -44,10 +44,13 @@ def find_domains(deck: Deck, mesh: Mesh, material: NDArray[np.int16]) -> tuple[N
             except InputError as error:
                 if len(nodes) == mesh.n_nodes:
                     raise InputError(f"{deck.path}: {error}") from None
-        domains[part.integration_points] = nodes[found.domains]
+        of_parts.append((part.integration_points, nodes[found.domains]))
         across = 0 if allowed[nodes].all() else len(centres)
         counts = (found.limited, found.added, repaired, across)
         figures = {name: before + count for (name, before), count in zip(figures.items(), counts, strict=True)}
+    domains = np.empty((len(at), options.nodes), np.int64)  # only now: `support.find_domains` checks the memory
+    for points_of_part, own_domains in of_parts:
+        domains[points_of_part] = own_domains
     return domains, figures
 
 

@@ -189,7 +189,12 @@ def model_contents(path: Path) -> dict[str, Any]:
     """Sizes, sets, materials and figures of a model, as JSON can hold them."""
     with open_model(path) as file:
         blocks = [
-            {"name": block.name, "kind": block.kind.name, "cells": block.n_cells, "nodes": block.group["nodes"].shape[1]}
+            {
+                "name": block.name,
+                "kind": block.kind.name,
+                "cells": block.n_cells,
+                "nodes": block.group["nodes"].shape[1],
+            }
             for block in block_groups(file)
         ]
         return {

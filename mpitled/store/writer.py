@@ -395,7 +395,11 @@ class ResultWriter:
     def _write_cell_columns(self, grid: h5py.Group) -> None:
         blocks = [section.block for section in self._cells]
         columns: list[tuple[str, Any, list[Rows]]] = [
-            (f"CellData/{name}", dtype, [partial(_constant, -1) if b is None else partial(b.read, column) for b in blocks])
+            (
+                f"CellData/{name}",
+                dtype,
+                [partial(_constant, -1) if b is None else partial(b.read, column) for b in blocks],
+            )
             for name, dtype, column in (("cell_id", np.int64, "cells"), ("material", np.int16, "material"))
         ]
         for name, dtype, values in (
