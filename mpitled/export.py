@@ -230,11 +230,10 @@ def _by_node(ids: NDArray[np.int64], direction: int, values: NDArray[np.float64]
 
 def _grid(model: Model) -> Iterator[str]:
     yield "x,y,z,volume,sets\n"
-    n = len(model.hexahedra)
     names = [""] * len(model.domains)
     for name, members in model.cell_sets.items():
         if name != "all":
-            for point in (members[members >= n] - n).tolist():
+            for point in model.rows_of("support domains", members).tolist():
                 names[point] += f";{name}"
     rows = np.column_stack([model.domain_points, model.domain_volumes]).tolist()
     for (x, y, z, volume), several in zip(rows, names, strict=True):
@@ -259,7 +258,7 @@ def _quoted(name: str) -> str:
 def _scene(model: Model, scene: dict[str, Any], files: Sequence[str]) -> Iterator[str]:
     """The deck that the model was built from, with these files in place of its geometry."""
     yield "# Written by mpitled export. Fixed and displaced nodes are in the files of [mesh]; rotations are here too.\n"
-    if model.figures.get("cloud_parts", 0) > 1:
+    if model.figures.cloud_parts > 1:
         yield "# In the model each support domain has nodes of its own material only; made from these files, of any.\n"
     yield from (f"{key} = {toml.value(value)}\n" for key, value in scene.items() if not isinstance(value, dict | list))
     yield "\n[mesh]\n"

@@ -55,16 +55,17 @@ def included(deck: Deck) -> list[Path]:
 
 def divide(path: Path, n_parts: int, seed: int) -> str:
     """Partition a model in n_parts, stored in its file under that number; a table of the parts."""
-    hexahedra, domains, places = store.read_cells(path)
-    costs = cell_costs(store.read_points(path), hexahedra, domains)
-    graph = partition.cell_graph(hexahedra, domains, places)
+    cells = store.read_blocks(path)
+    costs = cell_costs(store.read_points(path), cells)
+    blocks = [partition.Block(block.nodes, block.kind.faces, block.columns.get("points")) for block in cells]
+    graph = partition.cell_graph(blocks)
     try:
         part = partition.cut(graph, n_parts, costs, seed)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from None
-    tables = partition.tables(hexahedra, domains, part, n_parts)
+    tables = partition.tables(blocks, part, n_parts)
     store.write_partition(path, tables)
-    return partition.figures(tables, costs, len(hexahedra), graph).describe()
+    return partition.figures(tables, costs, {block.name: len(block) for block in cells}, graph).describe()
 
 
 def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False, resume: bool = False) -> dict[str, Any]:

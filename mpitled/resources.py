@@ -1,4 +1,4 @@
-"""What this machine has room for: memory and disc, asked before they are taken."""
+"""Free memory and disc space of this machine, checked before they are used."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mpitled.errors import InputError
 
-#: Files in which Linux says what a process may still take: bytes, and the file with what is taken of them.
+#: Memory limits of control groups in Linux, each with the file of the present use, bytes.
 _GROUPS = (
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
     ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
@@ -17,7 +17,7 @@ _GROUPS = (
 
 
 def memory() -> int:
-    """Bytes that this process can still take: the least of what machine, control group and its own limits leave."""
+    """Bytes that this process can still allocate: within the machine, its control group and its own limits."""
     free = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
     for line in _text("/proc/meminfo").splitlines():
         if line.startswith("MemAvailable:"):
@@ -34,22 +34,26 @@ def memory() -> int:
 
 
 def check_memory(needed: float, what: str, remedy: str) -> None:
-    """InputError if `what`, which is about to take so many bytes, finds no room for them."""
+    """InputError if `what` needs more bytes than are free."""
     if needed > (free := memory()):
-        raise InputError(f"{what}: would take {told(needed)} of memory, and {told(free)} are free here; {remedy}")
+        raise InputError(
+            f"{what}: would take {format_bytes(needed)} of memory, and {format_bytes(free)} are free here; {remedy}"
+        )
 
 
 def check_disc(needed: float, directory: Path, what: str, remedy: str) -> None:
-    """InputError if a file system has no room for `what` of so many bytes in a directory, which need not be there."""
-    place = directory.resolve()
-    while not place.exists():
-        place = place.parent
-    free = shutil.disk_usage(place).free
+    """InputError if a file system has no space for `what` of so many bytes in a directory, which need not exist."""
+    existing = directory.resolve()
+    while not existing.exists():
+        existing = existing.parent
+    free = shutil.disk_usage(existing).free
     if needed > free:
-        raise InputError(f"{directory}: {what} takes {told(needed)}, and {told(free)} are free there; {remedy}")
+        raise InputError(
+            f"{directory}: {what} takes {format_bytes(needed)}, and {format_bytes(free)} are free there; {remedy}"
+        )
 
 
-def told(size: float) -> str:
+def format_bytes(size: float) -> str:
     """A size in words: "12.3 GB"."""
     for unit in ("B", "kB", "MB", "GB"):
         if size < 1000:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,88 +10,109 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-#: Faces of a hexahedron in the Abaqus/VTK node order.
-FACES = np.array([[0, 1, 2, 3], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
-
-#: Nodes that a support domain shares with its neighbours: as many as a face has with a hexahedron; with another support
-#: domain these, or half of its nodes if that is more. Cells with any node in common are hundreds in a dense cloud.
+#: Nodes that a cell without faces shares with its neighbours: as many as a face of a hexahedron has. Two such cells
+#: share these, or half of their nodes if that is more: in a dense cloud hundreds of cells have some node in common.
 SHARED = 4
 
-#: Nearest support domains that a support domain is joined to: as many as a hexahedron has faces.
+#: Nearest cells to which a cell without faces is joined: as many as a hexahedron has faces.
 NEAREST = 6
 
-#: Weight of an edge across a face inside a block of hexahedra; the unit of the others.
+#: Weight of an edge across a face inside a block of hexahedra; the unit of the other weights.
 FACE_WEIGHT = 64
 
 
 @dataclass(frozen=True, slots=True)
+class Block:
+    """Cells of one kind. Cells are numbered block after block."""
+
+    nodes: NDArray[np.int64]  # (n, k), global nodes of each cell
+    faces: NDArray[np.int64] | None = None  # (n_faces, nodes per face), local nodes; None: a mesh-free kind
+    points: NDArray[np.float64] | None = None  # (n, 3), integration points of mesh-free cells
+
+
+@dataclass(frozen=True, slots=True)
 class CellGraph:
-    """Undirected graph of cells (hexahedra first, then support domains) in compressed rows, as METIS takes it.
+    """Undirected graph of cells in compressed rows, as METIS takes it.
 
     Cell i has the neighbours adjncy[xadj[i]:xadj[i + 1]]; each edge is in both rows; no cell is its own neighbour.
     """
 
     xadj: NDArray[np.int64]  # (n_cells + 1,)
     adjncy: NDArray[np.int64]  # (2 n_edges,)
-    edge_weights: NDArray[np.int64] | None  # (2 n_edges,), at least 1; None: all alike
-    n_hexahedra: int
+    edge_weights: NDArray[np.int64] | None  # (2 n_edges,), at least 1; None: all equal
 
     @property
     def n_cells(self) -> int:
         return len(self.xadj) - 1
 
 
-def cell_graph(
-    hexahedra: NDArray[np.int64], domains: NDArray[np.int64], domain_points: NDArray[np.float64]
-) -> CellGraph:
-    """The graph of hexahedra (n, 8), support domains (m, k) by their nodes, and their integration points (m, 3).
+def connectivity(blocks: Sequence[Block]) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
+    """Compressed rows of the cells' nodes (offsets (n_cells + 1,), nodes), and the number of nodes in the mesh."""
+    flat = [np.ascontiguousarray(block.nodes, dtype=np.int64).ravel() for block in blocks if block.nodes.size]
+    nodes = flat[0] if len(flat) == 1 else np.concatenate([np.empty(0, np.int64), *flat])
+    sizes = [np.full(len(block.nodes), block.nodes.shape[1]) for block in blocks]
+    offsets = np.concatenate([[0], *sizes]).astype(np.int64, copy=False)
+    return np.cumsum(offsets, out=offsets), nodes, 1 + int(nodes.max(initial=-1))
 
-    Hexahedra are joined by faces; a support domain to the `NEAREST` domains around it and to all cells that share
-    enough nodes with it (see `SHARED`). Where that leaves pieces of the mesh that still have nodes in common, single
-    edges join them, so the graph is in one piece where the mesh is. Time and memory grow linearly with the cells.
 
-    An edge weighs the sum of 1 / (d - 1) over the shared nodes, each of d cells (the clique model of a net in Lengauer,
-    Combinatorial Algorithms for Integrated Circuit Layout, 1990), so that METIS, which sees edges, makes few halo
-    nodes. A dense cloud has many more edges a node than hexahedra have; if all weighed the same, cuts would avoid it.
+def cell_graph(blocks: Sequence[Block]) -> CellGraph:
+    """The graph of the cells of all blocks.
+
+    Cells with faces are joined across these. A cell without faces is joined to the `NEAREST` such cells around it and
+    to all cells that share enough nodes with it (see `SHARED`). Where pieces of the graph still have nodes in common,
+    single edges join them: the graph is in one piece where the mesh is. Time and memory grow linearly with the cells.
+
+    An edge weighs the sum of 1 / (d - 1) over the shared nodes, where d is the number of cells at the node (the clique
+    model of a net in Lengauer, Combinatorial Algorithms for Integrated Circuit Layout, 1990): METIS, which sees edges,
+    then makes few halo nodes. A dense cloud has many more edges per node than hexahedra have. With equal weights, cuts
+    would avoid the cloud.
     """
-    hexahedra = np.ascontiguousarray(hexahedra, dtype=np.int64).reshape(-1, 8)
-    domains = np.ascontiguousarray(domains, dtype=np.int64)
-    n_hexahedra, n_cells = len(hexahedra), len(hexahedra) + len(domains)
-    n_nodes = 1 + max(int(hexahedra.max(initial=-1)), int(domains.max(initial=-1)))
-    mates = _face_mates(hexahedra, n_nodes)
+    offsets, nodes, n_nodes = connectivity(blocks)
+    n_cells = len(offsets) - 1
+    mates = _face_mates(offsets, nodes, *_face_tables(blocks), n_nodes)
     pairs = np.empty((0, 2), dtype=np.int64)
-    if len(domains):
-        pairs = _domain_pairs(hexahedra, domains, domain_points, n_nodes)
+    if any(block.faces is None and len(block.nodes) for block in blocks):
+        pairs = _meshfree_pairs(blocks, offsets, nodes, n_nodes)
     tree = _forest(mates, pairs, n_cells)
     n_pieces = int(np.count_nonzero(tree == np.arange(n_cells)))
     if n_pieces > 1:
-        start, touching = _cells_of_nodes(hexahedra, domains, n_nodes)
+        start, touching = _cells_of_nodes(offsets, nodes, n_nodes)
         bridges = np.empty((n_pieces - 1, 2), dtype=np.int64)
         n_bridges = _bridges(tree, start, touching, bridges)
         pairs = np.concatenate([pairs, bridges[:n_bridges]])
     if len(pairs):
-        n_touching = np.bincount(hexahedra.ravel(), minlength=n_nodes) + np.bincount(domains.ravel(), minlength=n_nodes)
-        weights = _weights(hexahedra, domains, pairs, n_touching)
-        xadj, adjncy, edge_weights = _compressed_rows(mates, pairs, weights, n_cells)
-        return CellGraph(xadj, adjncy, edge_weights, n_hexahedra)
+        weights = _weights(offsets, nodes, pairs, np.bincount(nodes, minlength=n_nodes))
+        return CellGraph(*_compressed_rows(mates, pairs, weights, n_cells))
     xadj = np.concatenate([[0], np.cumsum(np.count_nonzero(mates >= 0, axis=1))])
-    return CellGraph(xadj, mates[mates >= 0], None, n_hexahedra)
+    return CellGraph(xadj, mates[mates >= 0], None)
 
 
-def _domain_pairs(
-    hexahedra: NDArray[np.int64], domains: NDArray[np.int64], domain_points: NDArray[np.float64], n_nodes: int
+def _face_tables(blocks: Sequence[Block]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Number of the first cell of each block (n_blocks + 1,), and faces (n_blocks, n_faces, nodes), padded with -1."""
+    shapes = [block.faces.shape for block in blocks if block.faces is not None]
+    tables = np.full((len(blocks), *np.max([(0, 1), *shapes], axis=0)), -1, np.int64)
+    for table, block in zip(tables, blocks, strict=True):
+        if block.faces is not None:
+            table[: block.faces.shape[0], : block.faces.shape[1]] = block.faces
+    return np.cumsum([0, *(len(block.nodes) for block in blocks)]), tables
+
+
+def _meshfree_pairs(
+    blocks: Sequence[Block], offsets: NDArray[np.int64], nodes: NDArray[np.int64], n_nodes: int
 ) -> NDArray[np.int64]:
-    """The edges of support domains, (n, 2) cells, the lower first, in order, each once.
+    """The edges of mesh-free cells, (n, 2) cells, the lower first, in order, each once.
 
     A pair is sorted as one number, its key: the lower cell times the number of cells, plus the higher.
     """
-    n_hexahedra, n_cells = len(hexahedra), len(hexahedra) + len(domains)
-    near = _nearest_keys(domain_points, n_hexahedra)
-    start, touching = _cells_of_nodes(hexahedra, domains, n_nodes)
-    n_sharing = _sharing_keys(domains, n_hexahedra, start, touching, near[:0])
+    n_cells = len(offsets) - 1
+    meshfree = np.concatenate([np.full(len(block.nodes), block.faces is None) for block in blocks])
+    points = np.concatenate([block.points for block in blocks if block.points is not None])
+    near = _nearest_keys(points, np.flatnonzero(meshfree), n_cells)
+    start, touching = _cells_of_nodes(offsets, nodes, n_nodes)
+    n_sharing = _sharing_keys(meshfree, offsets, nodes, start, touching, near[:0])
     keys = np.empty(len(near) + n_sharing, dtype=np.int64)
     keys[: len(near)] = near
-    _sharing_keys(domains, n_hexahedra, start, touching, keys[len(near) :])
+    _sharing_keys(meshfree, offsets, nodes, start, touching, keys[len(near) :])
     del near, start, touching  # a third of the peak of memory
     keys.sort()  # np.unique takes ten times as long, and four times the memory
     keys = keys[np.concatenate([[True], keys[1:] != keys[:-1]])[: len(keys)]]
@@ -99,97 +121,120 @@ def _domain_pairs(
     return pairs
 
 
-def _nearest_keys(points: NDArray[np.float64], n_hexahedra: int) -> NDArray[np.int64]:
-    """Keys of pairs of a support domain and each of the `NEAREST` around it, given their points."""
+def _nearest_keys(points: NDArray[np.float64], cells: NDArray[np.int64], n_cells: int) -> NDArray[np.int64]:
+    """Keys of pairs of a mesh-free cell and each of the `NEAREST` around it; points (n, 3) of cells (n,), ascending."""
     k = min(NEAREST + 1, len(points))
     near = cKDTree(points, balanced_tree=False).query(points, k=np.arange(1, k + 1))[1]
     # A point finds itself, but not always first where points coincide.
-    own = np.arange(len(points))[:, None]
-    keys = (np.minimum(own, near) + n_hexahedra) * (n_hexahedra + len(points)) + np.maximum(own, near) + n_hexahedra
-    return keys[near != own]
+    own, near = cells[:, None], cells[near]
+    return (np.minimum(own, near) * n_cells + np.maximum(own, near))[near != own]
 
 
 @njit(cache=True)
-def _sorted_face(hexahedra, cell, face):  # type: ignore[no-untyped-def]
-    """The four nodes of a face, ascending."""
-    a, b, c, d = FACES[face]
-    a, b, c, d = hexahedra[cell, a], hexahedra[cell, b], hexahedra[cell, c], hexahedra[cell, d]
-    a, b, c, d = min(a, b), max(a, b), min(c, d), max(c, d)
-    low, high = max(a, c), min(b, d)
-    return min(a, c), min(low, high), max(low, high), max(b, d)
+def _sorted_face(nodes, first, corners, face):  # type: ignore[no-untyped-def]
+    """Fills `face` with the nodes of a face, ascending; -1 after the last of a smaller face."""
+    for i in range(len(corners)):
+        face[i] = -1
+        if corners[i] >= 0:
+            node, j = nodes[first + corners[i]], i
+            while j > 0 and face[j - 1] > node:
+                face[j] = face[j - 1]
+                j -= 1
+            face[j] = node
 
 
 @njit(cache=True)
-def _face_mates(hexahedra, n_nodes):  # type: ignore[no-untyped-def]
-    """The hexahedron behind each face, (n, 6), or -1; each hexahedron once in a row.
+def _equal(a, b):  # type: ignore[no-untyped-def]
+    """Whether two arrays have the same entries; np.all would allocate a third."""
+    same = True
+    for i in range(len(a)):
+        same &= a[i] == b[i]
+    return same
 
-    Faces are put into buckets by their lowest node: only faces of one bucket can be alike, and it holds a dozen or so.
-    Of three hexahedra at one face (a faulty mesh) two are joined.
+
+@njit(cache=True)
+def _face_mates(offsets, nodes, first_cells, tables, n_nodes):  # type: ignore[no-untyped-def]
+    """The cell behind each face, (n_cells, n_faces), or -1; each cell once in a row.
+
+    Faces are put into buckets by their lowest node. Only faces of one bucket can be equal; a bucket holds a dozen or
+    so. Of three cells at one face (a faulty mesh) two are joined.
     """
-    n = len(hexahedra)
+    n, n_faces = len(offsets) - 1, tables.shape[1]
+    face, candidate = np.empty(tables.shape[2], np.int64), np.empty(tables.shape[2], np.int64)
+    block_of = np.empty(n, np.uint8)
     start = np.zeros(n_nodes + 1, np.int64)
-    for c in range(n):
-        for f in range(6):
-            start[_sorted_face(hexahedra, c, f)[0] + 1] += 1
+    for b in range(len(tables)):
+        for c in range(first_cells[b], first_cells[b + 1]):
+            block_of[c] = b
+            for f in range(n_faces):
+                if tables[b, f, 0] >= 0:
+                    _sorted_face(nodes, offsets[c], tables[b, f], face)
+                    start[face[0] + 1] += 1
     start = np.cumsum(start)
     free = start[:-1].copy()
-    bucket = np.empty(6 * n, np.int64)
-    mates = np.full((n, 6), -1)
+    bucket = np.empty(start[-1], np.int64)
+    mates = np.full((n, n_faces), -1)
     for c in range(n):
-        for f in range(6):
-            face = _sorted_face(hexahedra, c, f)
+        for f in range(n_faces):
+            if tables[block_of[c], f, 0] < 0:
+                continue
+            _sorted_face(nodes, offsets[c], tables[block_of[c], f], face)
             for i in range(start[face[0]], free[face[0]]):
-                other, g = divmod(bucket[i], 6)
-                if mates[other, g] < 0 and _sorted_face(hexahedra, other, g) == face:
-                    if other != c and not np.any(mates[c] == other):
-                        mates[c, f], mates[other, g] = other, c
-                    break
+                other, g = divmod(bucket[i], n_faces)
+                if mates[other, g] < 0:
+                    _sorted_face(nodes, offsets[other], tables[block_of[other], g], candidate)
+                    if _equal(candidate, face):
+                        if other != c and not np.any(mates[c] == other):
+                            mates[c, f], mates[other, g] = other, c
+                        break
             else:
-                bucket[free[face[0]]] = 6 * c + f
+                bucket[free[face[0]]] = n_faces * c + f
                 free[face[0]] += 1
     return mates
 
 
 @njit(cache=True)
-def _cells_of_nodes(hexahedra, domains, n_nodes):  # type: ignore[no-untyped-def]
+def _cells_of_nodes(offsets, nodes, n_nodes):  # type: ignore[no-untyped-def]
     """The cells that touch each node, ascending, in compressed rows (start, cells)."""
     start = np.zeros(n_nodes + 1, np.int64)
-    for kind in (hexahedra, domains):
-        for node in kind.flat:
-            start[node + 1] += 1
+    for node in nodes:
+        start[node + 1] += 1
     start = np.cumsum(start)
     free = start[:-1].copy()
     cells = np.empty(start[-1], np.int64)
-    first = 0
-    for kind in (hexahedra, domains):
-        for c in range(len(kind)):
-            for node in kind[c]:
-                cells[free[node]] = first + c
-                free[node] += 1
-        first += len(kind)
+    for c in range(len(offsets) - 1):
+        for node in nodes[offsets[c] : offsets[c + 1]]:
+            cells[free[node]] = c
+            free[node] += 1
     return start, cells
 
 
 @njit(cache=True)
-def _sharing_keys(domains, n_hexahedra, start, cells, keys):  # type: ignore[no-untyped-def]
-    """The number of pairs of a support domain and a lower cell that share enough nodes.
+def _sharing_keys(meshfree, offsets, nodes, start, cells, keys):  # type: ignore[no-untyped-def]
+    """The number of pairs of a mesh-free cell and a solid or lower mesh-free cell that share enough nodes.
 
     Fills `keys` with their keys unless it is empty.
     """
-    n_cells = n_hexahedra + len(domains)
+    n_cells = len(offsets) - 1
+    solid = np.flatnonzero(~meshfree)
+    last_solid = solid[-1] if len(solid) else -1
     common = np.zeros(n_cells, np.int32)
     n = 0
-    for d in range(n_hexahedra, n_cells):
-        for node in domains[d - n_hexahedra]:
+    for d in np.flatnonzero(meshfree):
+        for node in nodes[offsets[d] : offsets[d + 1]]:
             for c in cells[start[node] : start[node + 1]]:
                 if c >= d:
-                    break
+                    if c > last_solid:
+                        break
+                    if meshfree[c]:
+                        continue
                 common[c] += 1
-                if common[c] == (SHARED if c < n_hexahedra else max(SHARED, domains.shape[1] // 2)):
+                fewest = min(offsets[c + 1] - offsets[c], offsets[d + 1] - offsets[d])
+                if common[c] == (max(SHARED, fewest // 2) if meshfree[c] else SHARED):
                     if len(keys):
-                        keys[n] = c * n_cells + d
+                        keys[n] = min(c, d) * n_cells + max(c, d)
                     n += 1
-        for node in domains[d - n_hexahedra]:
+        for node in nodes[offsets[d] : offsets[d + 1]]:
             for c in cells[start[node] : start[node + 1]]:
                 common[c] = 0
     return n
@@ -197,7 +242,7 @@ def _sharing_keys(domains, n_hexahedra, start, cells, keys):  # type: ignore[no-
 
 @njit(cache=True)
 def _root(tree, cell):  # type: ignore[no-untyped-def]
-    """The cell that stands for the piece of this one; shortens the way for the next (Tarjan's path halving)."""
+    """The root of a cell's tree, with path halving (Tarjan)."""
     while tree[cell] != cell:
         tree[cell] = tree[tree[cell]]
         cell = tree[cell]
@@ -232,17 +277,16 @@ def _bridges(tree, start, cells, bridges):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _weights(hexahedra, domains, pairs, n_touching):  # type: ignore[no-untyped-def]
-    """The weight of each pair: nodes that both cells touch, those of few cells weigh more; at least 1."""
+def _weights(offsets, nodes, pairs, n_touching):  # type: ignore[no-untyped-def]
+    """The weight of each pair, at least 1: each node that both cells touch counts the more, the fewer cells it has."""
     # A node inside a block has 8 hexahedra, and a face 4 nodes.
     unit = FACE_WEIGHT / (4 / 7)
     weights = np.empty(len(pairs), np.int64)
-    n = len(hexahedra)
     for i in range(len(pairs)):
         a, b = pairs[i]
         weight = 0.0
-        for node in hexahedra[a] if a < n else domains[a - n]:
-            for other in hexahedra[b] if b < n else domains[b - n]:
+        for node in nodes[offsets[a] : offsets[a + 1]]:
+            for other in nodes[offsets[b] : offsets[b + 1]]:
                 if node == other:
                     weight += unit / (n_touching[node] - 1)
                     break
@@ -252,7 +296,7 @@ def _weights(hexahedra, domains, pairs, n_touching):  # type: ignore[no-untyped-
 
 @njit(cache=True)
 def _compressed_rows(mates, pairs, pair_weights, n_cells):  # type: ignore[no-untyped-def]
-    """The rows (xadj, adjncy, weights) of hexahedra joined by faces and of the other pairs."""
+    """The rows (xadj, adjncy, weights) of cells joined by faces and of the other pairs."""
     xadj = np.zeros(n_cells + 1, np.int64)
     for c in range(len(mates)):
         for mate in mates[c]:

@@ -1,14 +1,15 @@
-"""What each part consists of: cells, nodes, neighbours and the nodes shared with them; and figures of its quality."""
+"""The contents of each part: cells, nodes, neighbours and shared nodes; and figures of a partition's quality."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from partition.graph import CellGraph
+from partition.graph import Block, CellGraph, connectivity
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,22 +31,15 @@ class PartTables:
     shared_offsets: NDArray[np.int64]  # (len(neighbours) + 1,), into shared
 
 
-def tables(
-    hexahedra: NDArray[np.int64], domains: NDArray[np.int64], part: NDArray[np.int32], n_parts: int
-) -> PartTables:
-    """The tables of a partition `part` (n_cells,) of hexahedra (n, 8) and support domains (m, k), given by their nodes.
-
-    Nodes that no cell touches are in no part.
-    """
-    hexahedra = np.ascontiguousarray(hexahedra, dtype=np.int64).reshape(-1, 8)
-    domains = np.ascontiguousarray(domains, dtype=np.int64)
-    n_nodes = 1 + max(int(hexahedra.max(initial=-1)), int(domains.max(initial=-1)))
+def tables(blocks: Sequence[Block], part: NDArray[np.int32], n_parts: int) -> PartTables:
+    """The tables of a partition `part` (n_cells,) of the cells of all blocks. Nodes without a cell are in no part."""
+    offsets, cell_nodes, n_nodes = connectivity(blocks)
     cells = np.argsort(part, kind="stable")
     cell_offsets = _offsets(np.bincount(part, minlength=n_parts))
-    counts = _touched_nodes(hexahedra, domains, cells, cell_offsets, n_nodes, np.empty(0, np.int64))
+    counts = _touched_nodes(offsets, cell_nodes, cells, cell_offsets, n_nodes, np.empty(0, np.int64))
     node_offsets = _offsets(counts)
     nodes = np.empty(node_offsets[-1], np.int64)
-    _touched_nodes(hexahedra, domains, cells, cell_offsets, n_nodes, nodes)
+    _touched_nodes(offsets, cell_nodes, cells, cell_offsets, n_nodes, nodes)
     for p in range(n_parts):
         nodes[node_offsets[p] : node_offsets[p + 1]].sort()
 
@@ -94,14 +88,14 @@ def _offsets(counts: NDArray[np.integer]) -> NDArray[np.int64]:
 
 
 @njit(cache=True)
-def _touched_nodes(hexahedra, domains, cells, cell_offsets, n_nodes, nodes):  # type: ignore[no-untyped-def]
+def _touched_nodes(offsets, cell_nodes, cells, cell_offsets, n_nodes, nodes):  # type: ignore[no-untyped-def]
     """The number of nodes that each part's cells touch; fills `nodes` with them by part, unless it is empty."""
     last = np.full(n_nodes, -1)
     counts = np.zeros(len(cell_offsets) - 1, np.int64)
     n = 0
     for p in range(len(counts)):
         for c in cells[cell_offsets[p] : cell_offsets[p + 1]]:
-            for node in hexahedra[c] if c < len(hexahedra) else domains[c - len(hexahedra)]:
+            for node in cell_nodes[offsets[c] : offsets[c + 1]]:
                 if last[node] != p:
                     last[node] = p
                     if len(nodes):
@@ -115,8 +109,7 @@ def _touched_nodes(hexahedra, domains, cells, cell_offsets, n_nodes, nodes):  # 
 class PartFigures:
     """How good a partition is, part by part."""
 
-    hexahedra: NDArray[np.int64]  # (n_parts,)
-    domains: NDArray[np.int64]  # (n_parts,)
+    cells_of: Mapping[str, NDArray[np.int64]]  # cells (n_parts,) of each block, by the block's name
     cost: NDArray[np.float64]  # (n_parts,), in the unit of the cells' costs
     nodes: NDArray[np.int64]  # (n_parts,), shared ones included
     halo_nodes: NDArray[np.int64]  # (n_parts,), nodes that other parts touch too
@@ -127,7 +120,7 @@ class PartFigures:
     @property
     def cells(self) -> NDArray[np.int64]:
         """Cells of each part, (n_parts,)."""
-        return self.hexahedra + self.domains
+        return np.sum([*self.cells_of.values()], axis=0)
 
     @property
     def balance(self) -> float:
@@ -138,8 +131,7 @@ class PartFigures:
         """A table with a line for each part, for at most `most` parts, then the mean and the largest, and a summary."""
         columns = {
             "cells": self.cells,
-            "hexahedra": self.hexahedra,
-            "domains": self.domains,
+            **self.cells_of,
             "cost/mean": self.cost / self.cost.mean(),
             "nodes": self.nodes,
             "halo nodes": self.halo_nodes,
@@ -151,10 +143,11 @@ class PartFigures:
         rows = {str(p): [values[p] for values in columns.values()] for p in range(n_parts if n_parts <= most else 0)}
         rows["mean"] = [values.mean() for values in columns.values()]
         rows["largest"] = [values.max() for values in columns.values()]
-        lines = ["part".rjust(8) + "".join(name.rjust(12) for name in columns)]
+        widths = [max(12, len(name) + 2) for name in columns]
+        lines = ["part".rjust(8) + "".join(map(str.rjust, columns, widths))]
         for label, row in rows.items():
             texts = [f"{x:.4f}" if name == "cost/mean" else f"{x:.0f}" for name, x in zip(columns, row, strict=True)]
-            lines.append(label.rjust(8) + "".join(text.rjust(12) for text in texts))
+            lines.append(label.rjust(8) + "".join(map(str.rjust, texts, widths)))
         summary = f"{n_parts} parts: balance {self.balance:.4f} (largest/mean cost)"
         if self.cut is not None:
             summary += f", {self.cut.sum() // 2} edges cut"
@@ -162,13 +155,15 @@ class PartFigures:
 
 
 def figures(
-    tables: PartTables, costs: NDArray[np.float64], n_hexahedra: int, graph: CellGraph | None = None
+    tables: PartTables, costs: NDArray[np.float64], sizes: Mapping[str, int], graph: CellGraph | None = None
 ) -> PartFigures:
-    """Figures of a partition whose cells cost `costs` (n_cells,); cut edges with the graph."""
-    sizes = np.diff(tables.cell_offsets)
+    """Figures of a partition whose cells cost `costs` (n_cells,); cut edges with the graph.
+
+    `sizes` are the numbers of cells of the blocks, by name, in order.
+    """
     part = np.empty(len(tables.cells), dtype=np.int32)
-    part[tables.cells] = np.repeat(np.arange(tables.n_parts, dtype=np.int32), sizes)
-    hexahedra = np.bincount(part[:n_hexahedra], minlength=tables.n_parts)
+    part[tables.cells] = np.repeat(np.arange(tables.n_parts, dtype=np.int32), np.diff(tables.cell_offsets))
+    of_blocks = np.split(part, np.cumsum([*sizes.values()])[:-1])
     n_touching = np.bincount(tables.nodes)
     of_node = np.repeat(np.arange(tables.n_parts), np.diff(tables.node_offsets))
     cut = None
@@ -176,8 +171,7 @@ def figures(
         crossing = np.repeat(part, np.diff(graph.xadj))
         cut = np.bincount(crossing[crossing != part[graph.adjncy]], minlength=tables.n_parts)
     return PartFigures(
-        hexahedra=hexahedra,
-        domains=sizes - hexahedra,
+        cells_of={name: np.bincount(own, minlength=tables.n_parts) for name, own in zip(sizes, of_blocks, strict=True)},
         cost=np.bincount(part, costs, tables.n_parts).astype(np.float64, copy=False),
         nodes=np.diff(tables.node_offsets),
         halo_nodes=np.bincount(of_node[n_touching[tables.nodes] > 1], minlength=tables.n_parts),

@@ -498,7 +498,7 @@ def _other_layout(file: h5py.File) -> None:
 
 
 def _damaged_model(file: h5py.File) -> None:
-    file["domain_gradients"][3, 2, 1] *= 1 + 1e-9
+    file["blocks/1/gradients"][3, 2, 1] *= 1 + 1e-9
 
 
 def inject(top: Path, n_kills: int = 100, seed: int = 0) -> Faults:

@@ -344,7 +344,7 @@ def _model(path: Path) -> object:
     info.contents(path)
     store.read_model(path)
     store.read_scene(path)
-    store.read_cells(path)
+    store.read_blocks(path)
     for part in range(2):
         if store.has_partition(path, 2):
             localise(store.read_part(path, 2, part), 0.004, 0.1, "mean")

@@ -21,8 +21,9 @@ N_FRAMES = 4
 def frame(part: PartRows, k: int) -> tuple[dict[str, Any], dict[str, Any], dict[str, float]]:
     """Point data, cell data and series of frame k, as functions of global numbers and places."""
     nodes, points = part.nodes[part.owned], part.read("points")[part.owned]
-    points = np.concatenate([points, part.read("domain_points")])
-    displacement = np.concatenate([np.outer(nodes, [1.0, 10.0, 100.0]), np.zeros((len(part.read("domains")), 3))])
+    cloud = part.blocks[1]
+    points = np.concatenate([points, cloud.read("points")])
+    displacement = np.concatenate([np.outer(nodes, [1.0, 10.0, 100.0]), np.zeros((cloud.n_own, 3))])
     point_data = {"parameters": displacement + k, "displacement": points * k}
     return point_data, {"J": 1 + 1e-3 * part.read("cells") + k}, {"energy": 0.5 * k, "step": 10.0 * k}
 

@@ -16,6 +16,7 @@ import scaling
 from conftest import ranks
 
 import partition
+from mpitled.cells.kind import HEXAHEDRA
 from mpitled.mesh import structured_hexahedra
 
 
@@ -110,9 +111,9 @@ def test_the_predicted_time_of_a_step_is_that_of_the_slowest_rank():
     """A bar of 6 x 2 x 2 hexahedra, cut by hand into 1, 2 and 3 layers: 9 nodes between neighbours."""
     hexahedra = structured_hexahedra((6, 2, 2))
     part = np.array([0, 1, 1, 2, 2, 2], np.int32)[np.arange(24) % 6]
-    tables = partition.tables(hexahedra, np.empty((0, 12), np.int64), part, 3)
+    tables = partition.tables([partition.Block(hexahedra)], part, 3)
     cluster = predict.Cluster(latency=5e-6, bandwidth=1e9, rate=1e6, fixed=2e-6)
-    row = predict.step_time(partition.figures(tables, np.ones(24), 24), cluster)
+    row = predict.step_time(partition.figures(tables, np.ones(24), {"hexahedra": 24}), cluster)
     # Ranks have 4, 8, 12 cells of 1 us each, and 1, 2, 1 neighbours.
     transfer = 9 * 24 / 1e9 * 1e6
     steps = np.array([4 + 5 + transfer, 8 + 10 + 2 * transfer, 12 + 5 + transfer]) + 2
@@ -131,12 +132,12 @@ def test_predictions_rest_on_partitions_that_metis_makes(tmp_path, capsys):
         rows = list(csv.DictReader(file))
     assert [row["parts"] for row in rows] == ["3", "4", "8", "16"]
     assert (tmp_path / "predict.png").stat().st_size > 10_000
-    hexahedra, none = structured_hexahedra((24, 24, 24)), np.empty((0, 12), np.int64)
-    graph = partition.cell_graph(hexahedra, none, np.empty((0, 3)))
+    blocks = [partition.Block(structured_hexahedra((24, 24, 24)), HEXAHEDRA.faces)]
+    graph = partition.cell_graph(blocks)
     for row in rows:
         n = int(row["parts"])
         part = partition.cut(graph, n, np.ones(24**3))
-        direct = partition.figures(partition.tables(hexahedra, none, part, n), np.ones(24**3), len(hexahedra))
+        direct = partition.figures(partition.tables(blocks, part, n), np.ones(24**3), {"hexahedra": 24**3})
         assert float(row["balance"]) == pytest.approx(direct.balance, abs=0.005)
         assert float(row["halo_nodes_mean"]) == pytest.approx(direct.halo_nodes.mean(), rel=0.1)
     for arguments, words in ((["--parts", "100000"], "13824 cells into 100000"), (["--latency", "-1"], "above 0")):

@@ -12,6 +12,8 @@ from conftest import ROOT, complaint, mpitled
 
 from mpitled import deck, store
 from mpitled.errors import InputError
+from mpitled.mesh import CORNERS
+from mpitled.meshing.block import block_mesh
 from mpitled.model import build as model_build
 from mpitled.results import compare, field
 
@@ -88,10 +90,10 @@ def test_affine_field_is_reproduced_everywhere(runs, cloud):
 def test_places_are_found_in_distorted_hexahedra():
     """Forth through the trilinear map and back again; the cells are bent so that most do not hold their neighbour."""
     rng = np.random.default_rng(5)
-    model = model_build.block.block_mesh(deck.Block(size=(0.06, 0.05, 0.04), elements=(6, 5, 4)), deck.Cloud(), None)
+    model = block_mesh(deck.Block(size=(0.06, 0.05, 0.04), elements=(6, 5, 4)), deck.Cloud(), None)
     points = model.points + 0.25 * 0.01 * rng.uniform(-1, 1, model.points.shape)
     cells, xi = rng.integers(0, len(model.hexahedra), 2000), rng.uniform(-0.999, 0.999, (2000, 3))
-    shapes = (1 + model_build.hexahedra.CORNERS * xi[:, None]).prod(axis=2) / 8
+    shapes = (1 + CORNERS * xi[:, None]).prod(axis=2) / 8
     places = np.einsum("na,nai->ni", shapes, points[model.hexahedra[cells]])
     found, back, distance = field.locate(points, model.hexahedra, places)
     np.testing.assert_array_equal(found, cells)

@@ -11,11 +11,13 @@ from scipy.linalg import eigh
 
 from mpitled import kernels
 from mpitled.cells import hexahedra
+from mpitled.cells.kind import HEXAHEDRA, SUPPORT_DOMAINS
 from mpitled.laws import Material, NeoHookean, first_piola, strain_energy
 from mpitled.mesh import CORNERS, grid_points, structured_hexahedra
-from mpitled.parallel.subdomain import DOMAIN_NODE_COST, GATHERED_COST, cell_costs, localise
+from mpitled.model import CellBlock
+from mpitled.parallel.subdomain import cell_costs, localise
 from mpitled.solver.stability_check import StabilityCheck
-from mpitled.store import PartRows
+from mpitled.store import PartBlock, PartRows
 from mpitled.terms import State, apply
 
 BRAIN = Material("brain", NeoHookean(youngs_modulus=3000.0, poissons_ratio=0.49), 1000.0)
@@ -25,37 +27,45 @@ R, S, T = CORNERS.T
 MODES = np.stack([R * S, S * T, R * T, R * S * T], axis=1)
 
 
+def part_block(kind, first, columns):
+    """The cells of a block, all on the only part, in the order of their own numbers."""
+    n, k = columns["nodes"].shape
+    columns = {"cells": np.arange(first, first + n)} | columns
+    return PartBlock(kind.name, kind, k, n, n, first, lambda name, first, last: columns[name][first:last])
+
+
+def column(rows, kind, name="nodes"):
+    """A column of the cells of a kind."""
+    return np.concatenate([block.read(name) for block in rows.of_kind(kind.name)])
+
+
 def part(points, cells, domains, gradients, volumes, material, prescribed=((), ())):
     """A whole model as the only part, in the order of its own numbers."""
     n, n_domains = len(points), len(domains)
     columns = {
-        "cells": np.arange(len(cells) + n_domains),
-        "material": np.asarray(material, np.int16),
         "points": points,
         "mass": np.ones(n),
-        "hexahedra": cells,
-        "domains": domains,
-        "domain_volumes": volumes,
-        "domain_gradients": gradients,
-        "domain_shapes": np.full(domains.shape, 1 / 8),
     }
+    of_cloud = {"volumes": volumes, "gradients": gradients, "shapes": np.full(domains.shape, 1 / 8)}
+    material = np.asarray(material, np.int16)
     nothing = np.zeros(0, np.int64)
     return PartRows(
         n_parts=1,
         part=0,
         n_nodes=n,
         n_fe_nodes=n if not n_domains else len(np.unique(cells)),
-        n_hexahedra=len(cells),
-        n_domains=n_domains,
-        n_own_hexahedra=len(cells),
-        n_own_domains=n_domains,
+        blocks=(
+            part_block(HEXAHEDRA, 0, {"nodes": cells, "material": material[: len(cells)]}),
+            part_block(SUPPORT_DOMAINS, len(cells), {"nodes": domains, "material": material[len(cells) :]} | of_cloud),
+        ),
+        field_block="",
         nodes=np.arange(n),
         owned=np.ones(n, bool),
         first_row=0,
         materials=(BRAIN, SOFT),
         prescribed_dofs=np.asarray(prescribed[0], np.int64),
         prescribed_displacements=np.asarray(prescribed[1], float),
-        prescribed_turns=np.zeros((len(prescribed[1]), 3)),
+        rotation_paths=np.zeros((len(prescribed[1]), 3)),
         field_nodes=nothing,
         field_domains=nothing,
         field_shapes=np.zeros((0, 8)),
@@ -95,22 +105,22 @@ def plain(sub_rows, u, stabilisation, rule="mean"):
     rows = sub_rows
     lam = np.array([m.lam for m in rows.materials])[rows.read("material")]
     mu = np.array([m.mu for m in rows.materials])[rows.read("material")]
-    n = rows.n_own_hexahedra
+    n = rows.n_own("hexahedra")
     kinds = []
     if n:
-        B, V = hexahedra.geometry(rows.read("points"), rows.read("hexahedra"), rule)
-        x = rows.read("points")[rows.read("hexahedra")]
+        B, V = hexahedra.geometry(rows.read("points"), column(rows, HEXAHEDRA), rule)
+        x = rows.read("points")[column(rows, HEXAHEDRA)]
         gamma = MODES - np.einsum("eai,ebi,bm->eam", B, x, MODES)
         k = HOURGLASS * (lam[:n] + 2 * mu[:n]) * V * (B**2).sum((1, 2)) / 8
-        kinds.append((rows.read("hexahedra"), B, V, k, np.einsum("eam,ebm->eab", gamma, gamma), slice(0, n)))
-    if rows.n_own_domains:
-        B, V = rows.read("domain_gradients"), rows.read("domain_volumes")
-        x = rows.read("points")[rows.read("domains")]
+        kinds.append((column(rows, HEXAHEDRA), B, V, k, np.einsum("eam,ebm->eab", gamma, gamma), slice(0, n)))
+    if rows.n_own("support domains"):
+        B, V = column(rows, SUPPORT_DOMAINS, "gradients"), column(rows, SUPPORT_DOMAINS, "volumes")
+        x = rows.read("points")[column(rows, SUPPORT_DOMAINS)]
         P = np.concatenate([np.ones((*x.shape[:2], 1)), x - x.mean(1, keepdims=True)], axis=2)
         Q = np.eye(x.shape[1]) - P @ np.linalg.inv(np.swapaxes(P, 1, 2) @ P) @ np.swapaxes(P, 1, 2)
         linear = (x - x.mean(1, keepdims=True)) @ np.linalg.inv(np.einsum("gai,gaj->gij", P[..., 1:], P[..., 1:]))
         k = stabilisation * (lam[n:] + 2 * mu[n:]) * V * (linear**2).sum((1, 2)) / 8
-        kinds.append((rows.read("domains"), B, V, k, Q, slice(n, None)))
+        kinds.append((column(rows, SUPPORT_DOMAINS), B, V, k, Q, slice(n, None)))
     for nodes, B, V, k, Q, these in kinds:
         X = np.eye(3) + np.einsum("eai,eaj->eij", u[nodes], B)
         P, W = np.empty_like(X), np.empty(len(X))
@@ -208,11 +218,16 @@ def test_nodes_behind_a_run_are_no_cell():
 @pytest.mark.parametrize("scene", SCENES)
 def test_cells_cost_by_what_computes_them(scene):
     rows = SCENES[scene]()
-    sub = localise(rows.holding(material=0 * rows.read("material")), HOURGLASS, 0.1, "mean")
-    costs = cell_costs(rows.read("points"), rows.read("hexahedra"), rows.read("domains"))
+    sub = localise(rows.with_columns(material=0 * rows.read("material")), HOURGLASS, 0.1, "mean")
+    blocks = [CellBlock(block.name, block.kind, block.read("nodes"), block.read("material")) for block in rows.blocks]
+    costs = cell_costs(rows.read("points"), blocks)
     in_runs = sum(cells.n_cells for cells in sub.packed if cells.name == "voxel hexahedra")
-    of_domain = DOMAIN_NODE_COST * rows.read("domains").shape[1]
-    expected = [1.0] * in_runs + [GATHERED_COST] * (rows.n_own_hexahedra - in_runs) + [of_domain] * rows.n_own_domains
+    of_domain = SUPPORT_DOMAINS.node_cost * column(rows, SUPPORT_DOMAINS).shape[1]
+    expected = (
+        [1.0] * in_runs
+        + [8 * HEXAHEDRA.node_cost] * (rows.n_own("hexahedra") - in_runs)
+        + [of_domain] * rows.n_own("support domains")
+    )
     assert sorted(costs) == sorted(expected)
 
 
@@ -285,12 +300,12 @@ def test_the_bound_holds_the_true_stiffness(scene, stretch):
     M - dt^2 / 4 K must be positive semidefinite: by central differences of the forces, a dense tangent.
     """
     rows = SCENES[scene]()
-    keep = slice(0, 24) if rows.n_own_hexahedra else slice(0, 16)
-    if rows.n_own_hexahedra:
-        used = np.unique(rows.read("hexahedra")[keep])
+    keep = slice(0, 24) if rows.n_own("hexahedra") else slice(0, 16)
+    if rows.n_own("hexahedra"):
+        used = np.unique(column(rows, HEXAHEDRA)[keep])
         rows = part(
             rows.read("points")[used],
-            np.searchsorted(used, rows.read("hexahedra")[keep]),
+            np.searchsorted(used, column(rows, HEXAHEDRA)[keep]),
             *no_domains(),
             rows.read("material")[keep],
         )

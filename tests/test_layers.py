@@ -84,8 +84,8 @@ def test_layers_are_exact_to_round_off(tmp_path, cloud, contrast, support):
     # The patch test's bound (test_support), and the stiffer layer's stress is a difference of ones.
     assert residual(model) < 18 * 20 * EPS * 49 * CONTRAST
     if cloud != "none":
-        assert model.figures["domains_across"] == 0
-        assert model.figures["consistency_after"] < 100 * EPS
+        assert model.figures.domains_across == 0
+        assert model.figures.consistency_after < 100 * EPS
         smeared = discretise(scene, replace(mesh, parts=(), surface_areas=None))
         assert residual(smeared) > 1e-2
 
@@ -152,7 +152,7 @@ def test_a_layer_with_too_few_nodes_takes_of_all(tmp_path):
     path.write_text(text + "[support]\nnodes = 24\nmax_fe_nodes = 24\n")
     model = build(deck.load_deck(path))
     upper = model.material == 1
-    assert model.figures["domains_across"] == upper.sum() > 0
+    assert model.figures.domains_across == upper.sum() > 0
     assert model.points[model.domains[~upper]][..., 2].max() == 0.02
     assert (np.bincount(model.domains.ravel(), minlength=model.n_nodes) >= 2).all()
     path.write_text(text + "[support]\nnodes = 100\nmax_fe_nodes = 100\n")
@@ -175,7 +175,7 @@ def test_spheres_apart_are_parts_that_share_nothing(tmp_path):
     for one in mesh.parts:
         inside = names[len(model.hexahedra) + one.integration_points]
         assert set(inside) == set(one.spheres or ("lower",))
-    assert model.figures["consistency_after"] < 100 * EPS
+    assert model.figures.consistency_after < 100 * EPS
 
 
 def test_a_cloud_is_as_fine_as_the_interface(tmp_path):

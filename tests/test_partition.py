@@ -12,18 +12,19 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from mpitled.cells.kind import HEXAHEDRA
 from mpitled.mesh import grid_points, structured_hexahedra
-from partition import CellGraph, PartTables, cell_graph, cut, figures, tables
+from partition import Block, CellGraph, PartTables, cell_graph, cut, figures, tables
 
-NO_DOMAINS = np.empty((0, 8), dtype=np.int64)
-NO_POINTS = np.empty((0, 3))
 COSTS = (1.0, 1.3)  # of a hexahedron and of a support domain
 
 
-def mixed(
-    n: int, core: float = 0.5, nodes: int = 8, share: float = 1.0
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Hexahedra, support domains, their points: n^3 cells whose core is a random cloud with 8 `share` points a cell."""
+def solid(hexahedra: NDArray[np.int64]) -> Block:
+    return Block(hexahedra, faces=HEXAHEDRA.faces)
+
+
+def mixed(n: int, core: float = 0.5, nodes: int = 8, share: float = 1.0) -> list[Block]:
+    """Hexahedra and support domains: n^3 cells whose core is a random cloud with 8 `share` points a cell."""
     rng = np.random.default_rng(1)
     hexahedra, points = structured_hexahedra((n, n, n)), grid_points((n, n, n), (1.0, 1.0, 1.0))
     centres = points[hexahedra].mean(axis=1)
@@ -34,11 +35,16 @@ def mixed(
     domain_points = (centres[in_core][:, None] + eighths).reshape(-1, 3)
     domain_points = domain_points[rng.random(len(domain_points)) < share]
     domain_points += rng.uniform(-0.1 / n, 0.1 / n, domain_points.shape)
-    return hexahedra[~in_core], cKDTree(points).query(domain_points, k=nodes)[1], domain_points
+    domains = cKDTree(points).query(domain_points, k=nodes)[1]
+    return [solid(hexahedra[~in_core]), Block(domains, points=domain_points)]
 
 
-def costs(hexahedra: NDArray[np.int64], domains: NDArray[np.int64]) -> NDArray[np.float64]:
-    return np.repeat(COSTS, [len(hexahedra), len(domains)])
+def costs(blocks: list[Block]) -> NDArray[np.float64]:
+    return np.repeat(COSTS, [len(block.nodes) for block in blocks])
+
+
+def sizes(blocks: list[Block]) -> dict[str, int]:
+    return dict(zip(("hexahedra", "domains"), (len(block.nodes) for block in blocks), strict=False))
 
 
 def edges(graph: CellGraph) -> set[tuple[int, int]]:
@@ -58,7 +64,7 @@ def test_hexahedra_are_joined_by_faces_whatever_their_numbers():
     """Inner faces of an nx x ny x nz block: (nx - 1) ny nz and so on."""
     nx, ny, nz = 5, 4, 3
     block = structured_hexahedra((nx, ny, nz))
-    graph = cell_graph(block, NO_DOMAINS, NO_POINTS)
+    graph = cell_graph([solid(block)])
     found = edges(graph)
     assert len(found) == 2 * ((nx - 1) * ny * nz + nx * (ny - 1) * nz + nx * ny * (nz - 1))
     i, j, k = np.unravel_index(np.arange(nx * ny * nz), (nx, ny, nz), order="F")
@@ -69,15 +75,16 @@ def test_hexahedra_are_joined_by_faces_whatever_their_numbers():
     cells, nodes = rng.permutation(len(block)), rng.permutation(block.max() + 1)
     # Rotations of the corners about the local z axis, so that faces meet in every orientation.
     turned = np.stack([h[(np.arange(8) // 4) * 4 + (np.arange(8) + r) % 4] for h, r in zip(block, cells, strict=True)])
-    shuffled = edges(cell_graph(nodes[turned][cells], NO_DOMAINS, NO_POINTS))
+    shuffled = edges(cell_graph([solid(nodes[turned][cells])]))
     assert {(cells[a], cells[b]) for a, b in shuffled} == found
 
 
 @pytest.mark.parametrize("nodes", [8, 20])
 def test_support_domains_are_joined_to_the_nearest_and_to_those_that_share_nodes(nodes):
-    hexahedra, domains, points = mixed(6, nodes=nodes, share=0.4)
-    graph = cell_graph(hexahedra, domains, points)
+    blocks = mixed(6, nodes=nodes, share=0.4)
+    graph = cell_graph(blocks)
     found = edges(graph)
+    hexahedra, domains, points = blocks[0].nodes, blocks[1].nodes, blocks[1].points
     n = len(hexahedra)
     assert all((b, a) in found and a != b for a, b in found)
     assert pieces(graph) == 1
@@ -89,14 +96,14 @@ def test_support_domains_are_joined_to_the_nearest_and_to_those_that_share_nodes
     for a in range(n, len(touched)):
         needed = [4] * n + [max(4, nodes // 2)] * (a - n)
         expected |= {(a, b) for b in range(a) if len(touched[a] & touched[b]) >= needed[b]}
-    hexahedra_only = edges(cell_graph(hexahedra, NO_DOMAINS, NO_POINTS))
+    hexahedra_only = edges(cell_graph([solid(hexahedra)]))
     assert found == expected | {(b, a) for a, b in expected} | hexahedra_only
 
 
 def test_graph_is_in_one_piece_where_the_mesh_is():
     """Two hexahedra at one edge have no face in common, and a third touches neither."""
     shared_edge = np.array([[0, 1, 2, 3, 4, 5, 6, 7], [2, 8, 9, 10, 6, 11, 12, 13], np.arange(20, 28)])
-    graph = cell_graph(shared_edge, NO_DOMAINS, NO_POINTS)
+    graph = cell_graph([solid(shared_edge)])
     assert edges(graph) == {(0, 1), (1, 0)}
 
 
@@ -105,33 +112,31 @@ def test_graph_is_in_one_piece_where_the_mesh_is():
     [("hexahedra", 2), ("hexahedra", 7), ("cloud", 4), ("mixed", 2), ("mixed", 5), ("mixed", 16)],
 )
 def test_parts_have_equal_cost_and_their_tables_agree(scene, n_parts):
-    hexahedra, domains, points = mixed(10, core={"hexahedra": 0.0, "cloud": 1.1, "mixed": 0.5}[scene], share=0.4)
-    graph = cell_graph(hexahedra, domains, points)
-    part = cut(graph, n_parts, costs(hexahedra, domains), seed=3)
-    assert np.array_equal(part, cut(graph, n_parts, costs(hexahedra, domains), seed=3))
+    blocks = mixed(10, core={"hexahedra": 0.0, "cloud": 1.1, "mixed": 0.5}[scene], share=0.4)
+    graph = cell_graph(blocks)
+    part = cut(graph, n_parts, costs(blocks), seed=3)
+    assert np.array_equal(part, cut(graph, n_parts, costs(blocks), seed=3))
     assert part.dtype == np.int32
     assert set(part) == set(range(n_parts))
 
-    found = tables(hexahedra, domains, part, n_parts)
-    quality = figures(found, costs(hexahedra, domains), len(hexahedra), graph)
+    found = tables(blocks, part, n_parts)
+    quality = figures(found, costs(blocks), sizes(blocks), graph)
     # METIS leaves a bisection within 0.1 % or two mean cells; halved again and again, these add up to four cells.
     mean = quality.cost.mean()
     assert quality.cost.max() <= mean * 1.001 ** np.ceil(np.log2(n_parts)) + 4 * max(COSTS)
-    check_tables(found, hexahedra, domains, part, n_parts)
+    check_tables(found, blocks, part, n_parts)
 
     rows = np.repeat(np.arange(graph.n_cells), np.diff(graph.xadj))
     assert quality.cut.sum() == np.count_nonzero(part[rows] != part[graph.adjncy])
-    assert quality.cost.sum() == pytest.approx(len(hexahedra) * COSTS[0] + len(domains) * COSTS[1], rel=1e-12)
+    assert quality.cost.sum() == pytest.approx(costs(blocks).sum(), rel=1e-12)
     text = quality.describe()
     assert len(text.splitlines()) == n_parts + 4
     assert f"{n_parts} parts: balance {quality.balance:.4f}" in text
 
 
-def check_tables(
-    found: PartTables, hexahedra: NDArray[np.int64], domains: NDArray[np.int64], part: NDArray[np.int32], n_parts: int
-) -> None:
+def check_tables(found: PartTables, blocks: list[Block], part: NDArray[np.int32], n_parts: int) -> None:
     """The tables against sets of nodes, part by part."""
-    cells = [*hexahedra.tolist(), *domains.tolist()]
+    cells = [cell for block in blocks for cell in block.nodes.tolist()]
     mine = [sorted({node for c in np.flatnonzero(part == p) for node in cells[c]}) for p in range(n_parts)]
     owner = {node: p for p in reversed(range(n_parts)) for node in mine[p]}
     for p in range(n_parts):
@@ -153,33 +158,33 @@ def check_tables(
 
 def test_parts_without_one_kind_of_cell():
     """Both occur where the core is several parts wide."""
-    hexahedra, domains, points = mixed(10, core=0.7)
-    part = cut(cell_graph(hexahedra, domains, points), 32, costs(hexahedra, domains))
-    found = tables(hexahedra, domains, part, 32)
-    quality = figures(found, costs(hexahedra, domains), len(hexahedra))
-    assert (quality.domains == 0).any()
-    assert (quality.hexahedra == 0).any()
+    blocks = mixed(10, core=0.7)
+    part = cut(cell_graph(blocks), 32, costs(blocks))
+    found = tables(blocks, part, 32)
+    quality = figures(found, costs(blocks), sizes(blocks))
+    assert (quality.cells_of["domains"] == 0).any()
+    assert (quality.cells_of["hexahedra"] == 0).any()
     assert quality.cut is None
-    check_tables(found, hexahedra, domains, part, 32)
+    check_tables(found, blocks, part, 32)
 
 
 def test_one_part_needs_no_metis(monkeypatch):
     monkeypatch.setitem(sys.modules, "pymetis", None)
-    hexahedra, domains, points = mixed(4)
-    graph = cell_graph(hexahedra, domains, points)
-    part = cut(graph, 1, costs(hexahedra, domains))
+    blocks = mixed(4)
+    graph = cell_graph(blocks)
+    part = cut(graph, 1, costs(blocks))
     assert part.dtype == np.int32
     assert part.tolist() == [0] * graph.n_cells
-    found = tables(hexahedra, domains, part, 1)
-    check_tables(found, hexahedra, domains, part, 1)
+    found = tables(blocks, part, 1)
+    check_tables(found, blocks, part, 1)
     with pytest.raises(ImportError):
-        cut(graph, 2, costs(hexahedra, domains))
+        cut(graph, 2, costs(blocks))
 
 
 def test_as_many_parts_as_cells_but_no_more():
     """METIS leaves a part of 27 single cells empty; none is in the end."""
     block = structured_hexahedra((3, 3, 3))
-    graph = cell_graph(block, NO_DOMAINS, NO_POINTS)
+    graph = cell_graph([solid(block)])
     assert sorted(cut(graph, 27, np.ones(27))) == list(range(27))
     with pytest.raises(ValueError, match="cannot cut 27 cells into 28 parts"):
         cut(graph, 28, np.ones(27))
@@ -191,12 +196,12 @@ def test_as_many_parts_as_cells_but_no_more():
 
 def test_edge_weights_leave_fewer_halo_nodes():
     """A dense cloud has many more edges a node than hexahedra: weighed alike, METIS cuts around it, not through."""
-    hexahedra, domains, points = mixed(16)
-    graph = cell_graph(hexahedra, domains, points)
+    blocks = mixed(16)
+    graph = cell_graph(blocks)
     halo = {}
     for name, weighed in {"nets": graph, "alike": replace(graph, edge_weights=None)}.items():
-        parts = [cut(weighed, 2, costs(hexahedra, domains), seed) for seed in range(3)]
-        halo[name] = sum(len(tables(hexahedra, domains, part, 2).shared) for part in parts)
+        parts = [cut(weighed, 2, costs(blocks), seed) for seed in range(3)]
+        halo[name] = sum(len(tables(blocks, part, 2).shared) for part in parts)
     assert halo["nets"] < halo["alike"]
 
 
@@ -204,20 +209,20 @@ def test_edge_weights_leave_fewer_halo_nodes():
 def test_four_million_hexahedra():
     """Seconds and peak memory of graph, cut and tables; run with -s to see them, alone in a process."""
     tables_of_few = structured_hexahedra((4, 4, 4))
-    tables(tables_of_few, NO_DOMAINS, cut(cell_graph(tables_of_few, NO_DOMAINS, NO_POINTS), 2, np.ones(64)), 2)
+    tables([solid(tables_of_few)], cut(cell_graph([solid(tables_of_few)]), 2, np.ones(64)), 2)
     block = structured_hexahedra((160, 160, 157))
     alike = np.ones(len(block))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     start = time.perf_counter()
-    graph = cell_graph(block, NO_DOMAINS, NO_POINTS)
+    graph = cell_graph([solid(block)])
     print(f"\ngraph {time.perf_counter() - start:.1f} s")
     part = cut(graph, 2, alike)
     print(f"cut {time.perf_counter() - start:.1f} s")
-    found = tables(block, NO_DOMAINS, part, 2)
+    found = tables([solid(block)], part, 2)
     seconds = time.perf_counter() - start
     peak = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024 / len(block)
     print(f"tables {seconds:.1f} s, peak {peak:.0f} bytes a cell")
-    print(figures(found, alike, len(block), graph).describe())
+    print(figures(found, alike, {"hexahedra": len(block)}, graph).describe())
     # Under 3 minutes and 1 KB a cell together with building the model: half of both is ours at most.
     assert seconds < 90
     assert peak < 500

@@ -286,7 +286,7 @@ def test_turned_nodes_keep_to_their_arcs(degrees):
     points, centre = rng.uniform(-1, 1, (50, 3)), np.array([0.3, -0.2, 0.9])
     for axis in range(3):
         rotation = Rotation(np.radians(degrees), axis, tuple(centre))
-        full, turns = loading.turn(points, rotation)
+        full, turns = loading.rotation_path(points, rotation)
         path, share = np.empty(full.size), 0.37
         kernels.follow(path, full.ravel(), turns.reshape(-1, 3), share)
         across = [(axis + 1) % 3, (axis + 2) % 3]

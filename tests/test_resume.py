@@ -227,7 +227,7 @@ def test_nobody_computes_with_what_is_damaged(stopped, monkeypatch, capsys):
     out = ["--out", str(folder / "made")]
     for path, array, commands in (
         (model, "points", (["report"], ["compare", str(folder)], ["export", "--abaqus", *out], ["partition", "2"])),
-        (model, "hexahedra", (["report"], ["partition", "2"], ["predict", "--parts", "2", *out])),
+        (model, "blocks/0/nodes", (["report"], ["partition", "2"], ["predict", "--parts", "2", *out])),
         (result, "VTKHDF/PointData/displacement", (["report"], ["compare", str(folder)])),
         (result, "VTKHDF/FieldData/strain_energy", (["report", "--html"],)),
     ):
@@ -249,7 +249,7 @@ def test_a_damaged_model_is_built_anew(stopped, monkeypatch, capsys):
     path = folder / "model.h5"
     whole = path.read_bytes()
     with h5py.File(path, "r+") as file:
-        file["domain_gradients"][3, 2, 1] *= 1 + 1e-12
+        file["blocks/1/gradients"][3, 2, 1] *= 1 + 1e-12
     run(deck, folder, monkeypatch, resume=True)
     assert "it is built anew" in capsys.readouterr().err
     assert path.read_bytes() == whole

@@ -17,11 +17,14 @@ from parallel_store import N_FRAMES, frame, write
 
 import partition
 from mpitled import store
+from mpitled.cells.kind import HEXAHEDRA, SUPPORT_DOMAINS
 from mpitled.errors import InputError
 from mpitled.laws import Material, NeoHookean
 from mpitled.mesh import grid_points, structured_hexahedra
-from mpitled.model import Model
+from mpitled.model import CellBlock, Model, ModelFigures
 from mpitled.store import files
+
+CLOUD_COLUMNS = {"points": (3,), "volumes": (), "gradients": (8, 3), "shapes": (8,)}
 
 
 def small_model(seed: int = 0) -> Model:
@@ -36,19 +39,21 @@ def small_model(seed: int = 0) -> Model:
     others = [rng.choice(np.setdiff1d(np.r_[:5, cloud], first), n - 1, replace=False) for first in firsts]
     domains = np.sort(np.c_[firsts, others], axis=1)
     dofs = np.sort(rng.choice(3 * (n_fe + n_efg), 50, replace=False))
+    columns = {name: rng.random((n_domains, *shape)) for name, shape in CLOUD_COLUMNS.items()}
+    material = rng.integers(2, size=len(hexahedra) + n_domains).astype(np.int16)
+    of_blocks = np.split(material, [len(hexahedra)])
+    blocks = (
+        CellBlock("hexahedra", HEXAHEDRA, hexahedra, of_blocks[0]),
+        CellBlock("support domains", SUPPORT_DOMAINS, domains, of_blocks[1], columns),
+    )
     return Model(
         points=np.r_[fe_points, 0.04 + 0.01 * rng.random((n_efg, 3))],
         n_fe_nodes=n_fe,
         node_ids=rng.permutation(n_fe + n_efg) + 1000,
-        hexahedra=hexahedra,
-        domains=domains,
-        domain_points=rng.random((n_domains, 3)),
-        domain_volumes=rng.random(n_domains),
-        domain_gradients=rng.random((n_domains, n, 3)),
-        domain_shapes=rng.random((n_domains, n)),
+        blocks=blocks,
+        field_block=blocks[-1].name,
         field_domains=rng.integers(n_domains, size=n_efg),
         field_shapes=rng.random((n_efg, n)),
-        material=rng.integers(2, size=len(hexahedra) + n_domains).astype(np.int16),
         materials=(
             Material("brain", NeoHookean(youngs_modulus=3000.0, poissons_ratio=0.49), 1000.0),
             Material("cerebrospinal fluid", NeoHookean(youngs_modulus=10.0, poissons_ratio=0.1), 1000.0),
@@ -56,10 +61,10 @@ def small_model(seed: int = 0) -> Model:
         mass=rng.random(n_fe + n_efg),
         prescribed_dofs=dofs,
         prescribed_displacements=rng.random(len(dofs)),
-        prescribed_turns=rng.random((len(dofs), 3)),
+        rotation_paths=rng.random((len(dofs), 3)),
         node_sets={"skull": np.arange(7), "left/right é": np.array([3, 5]), "none": np.empty(0, np.int64)},
         cell_sets={"all": np.arange(len(hexahedra) + n_domains)},
-        figures={"void_volume_m3": 1 / 3, "seed_volume_m3": 0.0},
+        figures=ModelFigures(1e-4, 0.1, 1e-4, of_mesh={"void_volume_m3": 1 / 3, "seed_volume_m3": 0.0}),
         remarks=("merged 3 nodes", "skipped a tetrahedron"),
     )
 
@@ -73,7 +78,9 @@ def random_parts(model: Model, n_parts: int) -> NDArray[np.int32]:
 
 
 def add_partition(path: Path, model: Model, parts: NDArray[np.int32], n_parts: int) -> None:
-    store.write_partition(path, partition.tables(model.hexahedra, model.domains, parts, n_parts))
+    store.write_partition(
+        path, partition.tables([partition.Block(block.nodes) for block in model.blocks], parts, n_parts)
+    )
 
 
 def same(a: object, b: object) -> bool:
@@ -91,11 +98,14 @@ def test_model_comes_back_as_it_was(tmp_path: Path) -> None:
     assert store.model_key(path) == "key of the deck"
     back = store.read_model(path)
     for column in fields(Model):
-        assert same(getattr(model, column.name), getattr(back, column.name)), column.name
+        if column.name != "blocks":
+            assert same(getattr(model, column.name), getattr(back, column.name)), column.name
+    assert [(block.name, block.kind) for block in back.blocks] == [(block.name, block.kind) for block in model.blocks]
+    assert same(store.model_arrays(back), store.model_arrays(model))
     assert same(store.read_sets(path)[0], model.node_sets)
-    store.write_model(path, replace(model, node_sets={}, figures={"count": np.int64(3)}), "k")
+    store.write_model(path, replace(model, node_sets={}, figures=ModelFigures(cloud_parts=np.int64(3))), "k")
     assert store.read_model(path).node_sets == {}
-    assert store.read_model(path).figures == {"count": 3}
+    assert store.read_model(path).figures.cloud_parts == 3
     assert [p.name for p in tmp_path.iterdir()] == ["model.h5"]
 
 
@@ -160,26 +170,28 @@ def test_parts_are_the_rows_of_the_model(tmp_path: Path, n_parts: int) -> None:
         given = np.flatnonzero(np.isin(model.field_domains, domains))
         expected = {
             "cells": cells,
-            "nodes": np.unique([*rows.read("hexahedra").ravel(), *rows.read("domains").ravel()]).astype(np.int32),
+            "nodes": np.unique(np.concatenate([block.read("nodes").ravel() for block in rows.blocks])).astype(np.int32),
             "points": model.points[rows.nodes],
             "mass": model.mass[rows.nodes],
-            "hexahedra": model.hexahedra[cells[cells < n_hexahedra]],
-            "domains": model.domains[domains],
-            "domain_points": model.domain_points[domains],
-            "domain_volumes": model.domain_volumes[domains],
-            "domain_gradients": model.domain_gradients[domains],
-            "domain_shapes": model.domain_shapes[domains],
             "material": model.material[cells],
             "materials": model.materials,
             "prescribed_dofs": model.prescribed_dofs[here],
             "prescribed_displacements": model.prescribed_displacements[here],
-            "prescribed_turns": model.prescribed_turns[here],
+            "rotation_paths": model.rotation_paths[here],
             "field_nodes": given + model.n_fe_nodes,
-            "field_domains": model.field_domains[given],
+            "field_domains": np.searchsorted(domains, model.field_domains[given]),
             "field_shapes": model.field_shapes[given],
         }
         for name, value in expected.items():
             assert same(getattr(rows, name) if hasattr(rows, name) else rows.read(name), value), name
+        solid, cloud = rows.blocks
+        assert same(solid.read("nodes"), model.hexahedra[cells[cells < n_hexahedra]])
+        for name, column in {"nodes": model.domains, **model.blocks[1].columns}.items():
+            assert same(cloud.read(name), column[domains]), name
+        local = np.arange(rows.n_own_cells)
+        assert [solid.first_own + k if b is solid else cloud.first_own + k for b, k in map(rows.find_cell, local)] == [
+            *local
+        ]
         shares = np.split(rows.shared, rows.shared_offsets[1:-1]) if len(rows.neighbours) else []
         for q, nodes in zip(rows.neighbours, shares, strict=True):
             assert same(nodes, np.intersect1d(rows.nodes, read[q].nodes).astype(np.int64))
@@ -198,7 +210,7 @@ def test_parts_are_the_rows_of_the_model(tmp_path: Path, n_parts: int) -> None:
 @pytest.mark.parametrize("gap_bytes", [0, 1 << 16])
 def test_rows_are_read_by_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gap_bytes: int) -> None:
     monkeypatch.setattr(files, "_GAP_BYTES", gap_bytes)
-    monkeypatch.setattr(files, "_BLOCK_BYTES", 1 << 10)
+    monkeypatch.setattr(files, "_BUFFER_BYTES", 1 << 10)
     data = np.random.default_rng(0).random((5000, 4))
     with h5py.File(tmp_path / "rows.h5", "w") as file:
         file["data"] = data
@@ -372,7 +384,7 @@ def test_a_frame_holds_what_was_announced(model_path: Path, tmp_path: Path) -> N
     point_data, cell_data, _ = frame(part, 0)
     with pytest.raises(ValueError, match="every frame holds"):
         writer.write_frame(0.0, {"parameters": point_data["parameters"]}, cell_data)
-    with pytest.raises(ValueError, match="values for 60 rows"):
+    with pytest.raises(ValueError, match="values for 96 rows"):
         writer.write_frame(0.0, point_data, {"J": cell_data["J"][1:]})
     writer.write_frame(0.0, point_data, cell_data)
     with pytest.raises(ValueError, match="one more is written"):

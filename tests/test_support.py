@@ -321,11 +321,11 @@ def test_consistency_balances_constant_stress_and_keeps_affine_fields(tmp_path, 
     assert free.sum() > 100
     # Sums of some hundred products.
     assert np.abs(balance[free]).max() < 100 * EPS
-    assert model.figures["consistency_after"] < 100 * EPS
-    assert model.figures["consistency_before"] > 1e-3
+    assert model.figures.consistency_after < 100 * EPS
+    assert model.figures.consistency_before > 1e-3
     changed = model.domain_gradients - plain.domain_gradients
     change = np.sqrt((changed**2).sum() / (plain.domain_gradients**2).sum())
-    assert model.figures["consistency_change"] == pytest.approx(change, rel=1e-9)
+    assert model.figures.consistency_change == pytest.approx(change, rel=1e-9)
     # Affine fields: gradients of both, and nothing but the correction differs.
     for each in (plain, model):
         found = np.einsum("gai,gaj->gij", (each.points @ AFFINE.T)[each.domains], each.domain_gradients)
@@ -381,13 +381,13 @@ def test_orphans_are_removed_from_the_model_and_counted(tmp_path):
     path = tmp_path / "block.toml"
     path.write_text(text + "[cloud]\npoints_per_spacing = 1.0\n")
     model = build(load_deck(path))
-    orphans = model.figures["orphans_removed"]
+    orphans = model.figures.orphans_removed
     assert orphans > 0
     assert any(f"{orphans} EFG nodes" in remark for remark in model.remarks)
     np.testing.assert_array_equal(np.unique(model.domains), np.arange(model.n_nodes))
     assert model.mass.min() > 0
     volume = 32e-3 * 28e-3 * 24e-3
     assert model.mass.sum() == pytest.approx(1000 * volume, rel=1e-12)
-    assert model.figures["volume_m3"] == pytest.approx(volume, rel=1e-12)
+    assert model.figures.volume_m3 == pytest.approx(volume, rel=1e-12)
     for axis, name in enumerate(("x0", "y0", "z0")):
         assert np.abs(model.points[model.node_sets[name], axis]).max() == 0

@@ -37,16 +37,16 @@ class Scene:
 
 
 def _unrotated(scene: Scene) -> Scene:
-    return scene.with_rows(prescribed_turns=np.zeros_like(scene.rows.prescribed_turns))
+    return scene.with_rows(rotation_paths=np.zeros_like(scene.rows.rotation_paths))
 
 
 def _one_material(scene: Scene) -> Scene:
-    return replace(scene, rows=scene.rows.holding(material=np.zeros(scene.rows.n_own_cells, np.int16)))
+    return replace(scene, rows=scene.rows.with_columns(material=np.zeros(scene.rows.n_own_cells, np.int16)))
 
 
 #: Each feature, and how to leave it out.
 FEATURES = {
-    "cells that are not boxes": lambda s: replace(s, rows=s.rows.holding(points=s.boxes.read("points"))),
+    "cells that are not boxes": lambda s: replace(s, rows=s.rows.with_columns(points=s.boxes.read("points"))),
     "hourglass control": lambda s: replace(s, hourglass=0.0),
     "stabilisation": lambda s: replace(s, stabilisation=0.0),
     "several materials": _one_material,
@@ -66,7 +66,7 @@ def measure(folder: Path, quick: bool) -> str:
     rotations = np.where(boxes.prescribed_displacements[:, None] != 0, [0.1, 1e-3, 1e-3], 0.0)
     # A shear turns boxes into parallelepipeds: the same cells, but in the general kernel.
     points = boxes.read("points")
-    rows = replace(boxes.holding(points=points + 1e-3 * points[:, [2, 0, 1]]), prescribed_turns=rotations)
+    rows = replace(boxes.with_columns(points=points + 1e-3 * points[:, [2, 0, 1]]), rotation_paths=rotations)
     complete = bare = Scene(rows, boxes, built["hourglass"], built["stabilisation"])
     scenes = {"(all features)": complete}
     for name, leave_out in FEATURES.items():

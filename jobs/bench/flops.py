@@ -89,8 +89,10 @@ def count_operations(folder: Path) -> dict[str, dict[str, float]]:
 
 def _count(path: Path, stabilisation: float) -> dict[str, float]:
     rows = store.read_part(path, 1, 0)
-    n_domains = rows.n_own_domains // BATCH_LANES * BATCH_LANES  # without the last, partly empty batch
-    sub = localise(replace(rows, n_own_domains=n_domains), HOURGLASS, stabilisation, "mean")
+    # Without the last batch of support domains, which is partly empty.
+    full = lambda block: block.n_own // BATCH_LANES * BATCH_LANES if block.kind.meshfree else block.n_own  # noqa: E731
+    rows = replace(rows, blocks=tuple(replace(block, n_own=full(block)) for block in rows.blocks))
+    sub = localise(rows, HOURGLASS, stabilisation, "mean")
     cells = {packed.name: packed.n_cells for packed in sub.packed}
     sub, state = _to_counting(sub), _to_counting(State.at_rest(sub, 1.0, 1e-6))
     counts = {}

@@ -20,8 +20,9 @@ from matplotlib.figure import Figure
 
 import partition
 from mpitled import atomic, job, store
+from mpitled.cells.kind import SUPPORT_DOMAINS
 from mpitled.errors import InputError
-from mpitled.parallel.subdomain import DOMAIN_NODE_COST, cell_costs
+from mpitled.parallel.subdomain import cell_costs
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +36,8 @@ class Cluster:
 
     def __str__(self) -> str:
         return (
-            f"{self.rate / 1e6:g} M boxes/s on a core (the node of a support domain costs {DOMAIN_NODE_COST:g} boxes), "
+            f"{self.rate / 1e6:g} M boxes/s on a core (the node of a support domain costs "
+            f"{SUPPORT_DOMAINS.node_cost:g} boxes), "
             f"{1e6 * self.fixed:g} us fixed per step,\n{1e6 * self.latency:g} us per message, "
             f"{self.bandwidth / 1e9:g} GB/s per rank; no contention in the network, no noise; the slowest rank counts"
         )
@@ -43,9 +45,11 @@ class Cluster:
 
 def predict(path: Path, counts: Sequence[int], cluster: Cluster, seed: int = 0) -> Iterator[dict[str, Any]]:
     """A row of the table for each number of parts of the model, the largest first. InputError for too few cells."""
-    hexahedra, domains, places = store.read_cells(path)
-    costs = cell_costs(store.read_points(path), hexahedra, domains)
-    graph = partition.cell_graph(hexahedra, domains, places)
+    cells = store.read_blocks(path)
+    costs = cell_costs(store.read_points(path), cells)
+    blocks = [partition.Block(block.nodes, block.kind.faces, block.columns.get("points")) for block in cells]
+    sizes = {block.name: len(block) for block in cells}
+    graph = partition.cell_graph(blocks)
     fine = 0
     for n_parts in sorted(set(counts), reverse=True):
         # METIS bisects: a part of 2^k parts is the union of consecutive parts of 2^(k+1).
@@ -55,8 +59,8 @@ def predict(path: Path, counts: Sequence[int], cluster: Cluster, seed: int = 0) 
                 fine, parts = n_parts, partition.cut(graph, n_parts, costs, seed)
             except ValueError as error:
                 raise InputError(f"{path}: {error}") from None
-        tables = partition.tables(hexahedra, domains, parts // (fine // n_parts), n_parts)
-        yield step_time(partition.figures(tables, costs, len(hexahedra)), cluster)
+        tables = partition.tables(blocks, parts // (fine // n_parts), n_parts)
+        yield step_time(partition.figures(tables, costs, sizes), cluster)
 
 
 def step_time(figures: partition.PartFigures, cluster: Cluster) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from mpitled.kernels.tensors import cofactor
 
 @njit(cache=True)
 def rotate_prescribed(path, full, turns, amplitude):  # type: ignore[no-untyped-def]
-    """path (n,) <- displacements, m, of dofs on the arcs of `loading.turn` at a share of the full load."""
+    """path (n,) <- displacements, m, of dofs on their rotation paths at a share of the full load."""
     for p in range(path.size):
         angle, arm, across = turns[p, 0], turns[p, 1], turns[p, 2]
         arc = (np.cos(amplitude * angle) - 1) * arm + np.sin(amplitude * angle) * across

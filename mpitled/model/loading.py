@@ -1,4 +1,4 @@
-"""How the prescribed motion grows: the loading curve, and the tumour's sphere."""
+"""Prescribed motion: the loading curve, the growing sphere of the tumour, and rotations."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def growth(
     return (grown / np.cbrt(cubed) - 1)[:, None] * (points - centre)
 
 
-def turn(points: NDArray[np.float64], rotation: Rotation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Displacements (n, 3), m at full load, of points (n, 3) that are turned, and (n, 3, 3) how they get there.
+def rotation_path(points: NDArray[np.float64], rotation: Rotation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Displacements (n, 3), m at full load, of points (n, 3) that are rotated, and their paths (n, 3, 3).
 
-    The last axis of the latter is, for each direction, the angle phi in rad, the arm r from the axis and e x r, both in
+    The last axis of the paths is, for each direction, the angle phi in rad, the arm r from the axis and e x r, both in
     m: at the share d of the load the displacement is (cos(d phi) - 1) r + sin(d phi) e x r.
     """
     arm = points - np.asarray(rotation.centre)
     arm[:, rotation.axis] = 0.0
     across = np.cross(np.eye(3)[rotation.axis], arm)
-    turns = np.stack([np.full_like(arm, rotation.angle), arm, across], axis=2)
-    return (np.cos(rotation.angle) - 1) * arm + np.sin(rotation.angle) * across, turns
+    paths = np.stack([np.full_like(arm, rotation.angle), arm, across], axis=2)
+    return (np.cos(rotation.angle) - 1) * arm + np.sin(rotation.angle) * across, paths

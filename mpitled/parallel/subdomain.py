@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled.cells import hexahedra, hexahedron_batches, support_domain_batches, voxel_runs
+from mpitled.cells import voxel_runs
+from mpitled.cells.kind import HEXAHEDRA
+from mpitled.cells.packers import PACKERS, CellOptions
 from mpitled.cells.packing import LocalCells, PackedCells
-from mpitled.store import PartRows
+from mpitled.model import CellBlock
+from mpitled.store import PartBlock, PartRows
 
-#: Costs in a step of relaxation, in those of a box in a run with its node: of a hexahedron that is gathered, and of
-#: each node of a support domain. A march asks 0.40 for that, single precision 0.26.
-GATHERED_COST = 3.8
-DOMAIN_NODE_COST = 0.36
 #: What `solver.precision` means for the cells' arithmetic.
 PRECISIONS: dict[str, type[np.floating]] = {"double": np.float64, "single": np.float32}
 
@@ -24,20 +23,21 @@ PRECISIONS: dict[str, type[np.floating]] = {"double": np.float64, "single": np.f
 class Subdomain:
     """The part of the model on one rank, in local numbers and SI units.
 
-    A cell lives on exactly one rank. A node lives on every rank whose cells touch it; all of them move it alike, and
-    its owner alone writes it and counts it in sums. Local cells are hexahedra first, then support domains.
+    A cell is on exactly one rank. A node is on every rank with a cell that touches it; all of these ranks move it
+    identically, and its owner alone writes it and counts it in sums. Local cells are numbered block after block.
     """
 
     rows: PartRows
-    domain_nodes: NDArray[np.uint32]  # (n_domains, n)
-    domain_shapes: NDArray[np.float64]  # (n_domains, n), at their integration points
+    #: Nodes and shape functions (n, k) at the integration points of each mesh-free block
+    clouds: tuple[tuple[NDArray[np.uint32], NDArray[np.float64]], ...]
+    field_domains: NDArray[np.uint32]  # (n_field_nodes, k), nodes of the cell that gives the field at an EFG node
     n_nodes: int
     n_cells: int
     packed: tuple[PackedCells, ...]  # the cells as the kernels take them, by kind and law
     fixed: NDArray[np.uint32]  # dofs (3 node + direction) that stay where they are
     moving: NDArray[np.uint32]  # dofs that follow the loading curve
     moving_full: NDArray[np.float64]  # (len(moving),), m at full load
-    moving_turns: NDArray[np.float64] | None  # (len(moving), 3), see `loading.turn`; None where all move straight
+    moving_turns: NDArray[np.float64] | None  # (len(moving), 3), see `loading.rotation_path`; None: all straight
     shared: tuple[tuple[int, NDArray[np.uint32]], ...]  # (rank, nodes shared with it), ranks ascending
     precision: type[np.floating]  # of the cells' arithmetic
 
@@ -66,15 +66,15 @@ class Subdomain:
         speed.reshape(-1)[self.moving] = velocity
         moves: NDArray[np.bool_] = np.any(speed, axis=1)
         steepest = 0.0
-        for kind in ("hexahedra", "domains"):
-            for first, nodes in rows.blocks(kind):
+        for block in rows.blocks:
+            for first, nodes in block.chunks("nodes"):
                 cells = rows.local(nodes)
                 near = moves[cells].any(axis=1)
                 if near.any():
-                    if kind == "hexahedra":
-                        gradients = hexahedra.geometry(points, cells[near])[0]
+                    if block.kind.geometry:
+                        gradients = block.gradients(points, cells[near], 0)
                     else:
-                        gradients = rows.read("domain_gradients", first, first + len(nodes))[near]
+                        gradients = block.gradients(points, cells, first)[near]
                     found = np.einsum("cai,caj->cij", speed[cells[near]], gradients)
                     steepest = max(steepest, float(np.sqrt((found**2).sum(axis=(1, 2)).max())))
         return steepest
@@ -83,51 +83,50 @@ class Subdomain:
 def localise(
     rows: PartRows, hourglass: float, stabilisation: float, rule: str, precision: type[np.floating] = np.float64
 ) -> Subdomain:
-    """Local numbers and packed cells of a part.
+    """Local numbers and packed cells of a part; see `CellOptions`.
 
-    hourglass is R_hg of eq. 4.22, stabilisation the share s of design (0: the paper's own support domains), rule the
-    hexahedron's gradient ("mean", or "centre" as in eq. 4.6). Local nodes ascend with the global ones, so that what
-    lay along a grid line still does.
+    Local nodes ascend with the global ones, so that nodes along a grid line stay consecutive.
     """
 
     def local(nodes: NDArray[np.int64]) -> NDArray[np.uint32]:
         return rows.local(nodes).astype(np.uint32, copy=False)
 
-    n_hexahedra, points, material = rows.n_own_hexahedra, rows.read("points"), rows.read("material")
-    cells = np.empty((n_hexahedra, 8), np.uint32)
-    for start, nodes in rows.blocks("hexahedra"):
-        cells[start : start + len(nodes)] = local(nodes)
-    domains = local(rows.read("domains"))
+    def nodes_of(block: PartBlock) -> NDArray[np.uint32]:
+        nodes = np.empty((block.n_own, block.n_nodes), np.uint32)
+        for first, some in block.chunks("nodes"):
+            nodes[first : first + len(some)] = local(some)
+        return nodes
+
+    points, options = rows.read("points"), CellOptions(hourglass, stabilisation, rule)
     shared = np.zeros(len(rows.nodes), bool)
     shared[local(rows.shared)] = True
+    packed: list[PackedCells] = []
+    clouds, field_domains = [], np.empty((0, 0), np.uint32)
+    for block in rows.blocks:
+        nodes = nodes_of(block)
+        cells = LocalCells(
+            points, nodes, block.first_own, rows.n_own_cells, block.read("material"), rows.materials, shared, precision,
+            block.read,
+        )  # fmt: skip
+        packed += PACKERS[block.kind.name](cells, options)
+        if block.kind.meshfree:
+            clouds.append((nodes, block.read("shapes")))
+        if block.name == rows.field_block:
+            field_domains = nodes[rows.field_domains]
     dofs = 3 * local(rows.prescribed_dofs // 3) + (rows.prescribed_dofs % 3).astype(np.uint32)
-    packing = partial(
-        LocalCells, points=points, n_rank_cells=rows.n_own_cells, materials=rows.materials, shared=shared,
-        precision=precision,
-    )  # fmt: skip
-    of_hexahedra = packing(nodes=cells, first=0, material=material[:n_hexahedra], column=rows.read)
-    of_domains = packing(
-        nodes=domains, first=n_hexahedra, material=material[n_hexahedra:],
-        column=lambda name: rows.read(f"domain_{name}"),
-    )  # fmt: skip
-    runs, gathered = voxel_runs.pack(of_hexahedra, hourglass)
-    turns = rows.prescribed_turns.any(axis=1)
-    moves = (rows.prescribed_displacements != 0) | turns
+    rotates = rows.rotation_paths.any(axis=1)
+    moves = (rows.prescribed_displacements != 0) | rotates
     return Subdomain(
         rows=rows,
-        domain_nodes=domains,
-        domain_shapes=rows.read("domain_shapes"),
+        clouds=tuple(clouds),
+        field_domains=field_domains,
         n_nodes=len(rows.nodes),
         n_cells=rows.n_own_cells,
-        packed=(
-            *runs,
-            *hexahedron_batches.pack(of_hexahedra, gathered, hourglass, rule),
-            *support_domain_batches.pack(of_domains, stabilisation),
-        ),
+        packed=tuple(packed),
         fixed=dofs[~moves],
         moving=dofs[moves],
         moving_full=rows.prescribed_displacements[moves],
-        moving_turns=rows.prescribed_turns[moves] if turns.any() else None,
+        moving_turns=rows.rotation_paths[moves] if rotates.any() else None,
         shared=tuple(
             (int(rank), local(rows.shared[first:last]))
             for rank, first, last in zip(
@@ -138,10 +137,10 @@ def localise(
     )
 
 
-def cell_costs(
-    points: NDArray[np.float64], hexahedra: NDArray[np.int64], domains: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """What each cell of a model costs in a step, (n_cells,): see `GATHERED_COST`."""
-    in_runs = voxel_runs.find_runs(points, hexahedra, np.zeros(len(hexahedra), np.int16)).in_runs
-    of_domain = DOMAIN_NODE_COST * domains.shape[1]
-    return np.concatenate([np.where(in_runs, 1.0, GATHERED_COST), np.full(len(domains), of_domain)])
+def cell_costs(points: NDArray[np.float64], blocks: Sequence[CellBlock]) -> NDArray[np.float64]:
+    """Cost (n_cells,) of each cell of a model in a step, relative to a box in a voxel run."""
+    costs = [np.full(len(block), block.kind.node_cost * block.nodes.shape[1]) for block in blocks]
+    for block, of_block in zip(blocks, costs, strict=True):
+        if block.kind is HEXAHEDRA:
+            of_block[voxel_runs.find_runs(points, block.nodes, np.zeros(len(block), np.int16)).in_runs] = 1.0
+    return np.concatenate(costs)

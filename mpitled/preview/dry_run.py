@@ -36,7 +36,12 @@ def dry_run(deck: Deck, directory: Path, world: World, *, verbose: bool = False)
     calls, surveyed = trace_kernels(terms), trace_kernels([("check", method.check)])
     seconds, survey = forecast.measure(method)
     step = sum(seconds.values())
-    counts = [sub.rows.n_own_hexahedra, sub.rows.n_own_domains, sub.n_nodes, sum(len(nodes) for _, nodes in sub.shared)]
+    counts = [
+        sub.rows.n_own("hexahedra"),
+        sub.rows.n_own("support domains"),
+        sub.n_nodes,
+        sum(len(nodes) for _, nodes in sub.shared),
+    ]
     sizes = [distinct_bytes(calls) / sub.n_cells, _held_bytes(method) / sub.n_cells]
     table = world.gather([*counts, *sizes, 1e3 * step, 1e3 * survey])
     lines = _forecast(run, table[:, -2].max() / 1e3, table[:, -1].max() / 1e3)
@@ -153,5 +158,5 @@ def _forecast(run: Any, step: float, survey: float) -> list[str]:
         f"steps: {expected.steps}{length}, {expected.surveys} surveys{more}",
         f"loop: {least}{expected.loop_s:.3g} s on the slowest rank ({1e3 * step:.3g} ms a step, "
         f"{1e3 * survey:.3g} ms a survey: the fastest of {forecast.CALLS} calls on this machine)",
-        f"output: {resources.told(run.output_bytes)} in {run.deck.output.frames + 1} frames",
+        f"output: {resources.format_bytes(run.output_bytes)} in {run.deck.output.frames + 1} frames",
     ]

@@ -43,7 +43,7 @@ class Forecast(NamedTuple):
         """In a line."""
         least = "at least " if self.at_least else ""
         steps = f"{least}{self.steps} steps of {1e3 * self.step_s:.2g} ms, so {least}{self.loop_s:.2g} s of stepping"
-        return f"{steps}, on one rank here; {resources.told(self.output_bytes)} of results"
+        return f"{steps}, on one rank here; {resources.format_bytes(self.output_bytes)} of results"
 
 
 def measure(method: Integrator) -> tuple[dict[str, float], float]:

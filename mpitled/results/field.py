@@ -254,7 +254,7 @@ def prescribed(model: Model) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Nodes (n_nodes,) that are prescribed in all three directions, and those of them that move."""
     nodes = model.prescribed_dofs // 3
     every = np.bincount(nodes, minlength=model.n_nodes) == 3
-    moves = np.bincount(nodes, (model.prescribed_displacements != 0) | model.prescribed_turns.any(1), model.n_nodes) > 0
+    moves = np.bincount(nodes, (model.prescribed_displacements != 0) | model.rotation_paths.any(1), model.n_nodes) > 0
     return every, every & moves
 
 

@@ -162,7 +162,7 @@ def _image_of(field: Field, run: Path) -> tuple[Image, Cells, list[Cells]]:
         raise InputError(f"{error}; it has changed since {run} was computed") from None
     voxel = float(image.voxel.prod())
     for name, mask in {"solid": body, **parts}.items():
-        volume = field.model.figures.get(f"image_{name}_volume_m3", np.nan)
+        volume = field.model.figures.of_mesh.get(f"image_{name}_volume_m3", np.nan)
         if not abs(mask.sum() * voxel - volume) <= _SAME * volume:
             raise InputError(f"{path}: has other labels than when {run} was computed; {remedy}")
     nodes = field.model.points[: field.model.n_fe_nodes]

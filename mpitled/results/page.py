@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled import atomic, store, toml
-from mpitled.cells import hexahedra
 from mpitled.deck import GEOMETRIES, unit_of
 from mpitled.results import markup, report
 from mpitled.results.report import LARGE, Outcome
@@ -125,7 +124,7 @@ def _scene(run: _Run) -> Iterator[str]:
     chosen += [("tumour", key, value) for key, value in deck.get("tumour", {}).items()]
     rows = [(f"{name}.{key}", f"{toml.value(value)} {unit_of(f'{name}.{key}')}".strip()) for name, key, value in chosen]
     yield markup.table([], rows, caption="Geometry" + (" and tumour" if "tumour" in deck else ""))
-    volumes = np.concatenate([hexahedra.volumes(model.points, model.hexahedra), model.domain_volumes])
+    volumes = model.volumes
     yield markup.table(
         ["material", "Young's modulus, Pa", "Poisson's ratio", "density, kg/m\u00b3", "cells", "volume, ml"],
         [
@@ -234,10 +233,8 @@ def _displacement(run: _Run) -> Iterator[str]:
         from mpitled.results import charts
 
         field = run.outcome.field
-        size = np.linalg.norm(
-            np.concatenate([field[model.hexahedra].mean(axis=1), run.outcome.domain_displacement]), axis=1
-        )
-        volumes = np.concatenate([hexahedra.volumes(model.points, model.hexahedra), model.domain_volumes])
+        size = np.linalg.norm(model.at_cells(field, run.outcome.domain_displacement), axis=1)
+        volumes = model.volumes
         yield _picture(
             lambda to: charts.draw_histogram(1e3 * size, volumes, 1e3 * LARGE, to),
             "Histogram: share of the body's volume in % against displacement in mm",

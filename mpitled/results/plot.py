@@ -76,7 +76,7 @@ def cuts(solid: Solid, centre: NDArray[np.float64] | None, title: str) -> Iterat
 
 def mesh(model: Model, solid: Solid, centre: NDArray[np.float64] | None) -> Figure:
     """The undeformed mesh: hexahedra and cloud by their material, and the cloud's nodes near the planes."""
-    of_hexahedra, of_domains = np.split(model.material, [len(model.hexahedra)])
+    of_hexahedra, of_domains = (model.of_kind(kind).material for kind in ("hexahedra", "support domains"))
     of_cloud, near = np.empty(0, np.int16), 0.0
     efg = np.arange(model.n_fe_nodes, model.n_nodes)
     if len(solid.cloud):

@@ -149,8 +149,8 @@ def compute(outcome: Outcome) -> dict[str, Any]:
     model, field = outcome.model, outcome.field
     size = np.linalg.norm(field, axis=1)
     fe_volumes = hexahedra.volumes(model.points, model.hexahedra)
-    volumes = np.concatenate([fe_volumes, model.domain_volumes])
-    at_cells = np.concatenate([field[model.hexahedra].mean(axis=1), outcome.domain_displacement])
+    volumes = model.volumes
+    at_cells = model.at_cells(field, outcome.domain_displacement)
     large = np.linalg.norm(at_cells, axis=1) > LARGE
     report: dict[str, Any] = {
         "title": outcome.metadata.get("title", ""),
@@ -309,7 +309,7 @@ def _ventricles(outcome: Outcome, fe_volumes: NDArray[np.float64]) -> dict[str, 
 def _in_ventricles(model: Model) -> dict[str, NDArray[np.int64]]:
     """Hexahedra of each ventricle that there is, left first."""
     sets = {side: model.cell_sets.get(name, np.empty(0, np.int64)) for side, name in VENTRICLES.items()}
-    found = {side: cells[cells < len(model.hexahedra)] for side, cells in sets.items()}
+    found = {side: model.rows_of("hexahedra", cells) for side, cells in sets.items()}
     return {side: cells for side, cells in found.items() if len(cells)}
 
 
@@ -339,13 +339,14 @@ def _midline_shift(outcome: Outcome, fe_volumes: NDArray[np.float64]) -> float |
 def _smallest(outcome: Outcome, volumes: NDArray[np.float64]) -> dict[str, Any]:
     """Where J is smallest in the last frame, and how much of the body is in cells that lost much of their volume."""
     model, jacobian = outcome.model, outcome.jacobian
-    cell, n = int(np.argmin(jacobian)), len(model.hexahedra)
-    place = model.points[model.hexahedra[cell]].mean(axis=0) if cell < n else model.domain_points[cell - n]
+    cell = int(np.argmin(jacobian))
+    block, row = model.find_cell(cell)
+    place = block.columns["points"][row] if block.kind.meshfree else model.points[block.nodes[row]].mean(axis=0)
     crushed = jacobian < CRUSHED
     return {
         "smallest_jacobian": {
             "now": float(jacobian[cell]),
-            "cell": "hexahedron" if cell < n else "support domain",
+            "cell": block.kind.singular,
             "material": model.materials[model.material[cell]].name,
             "place_mm": (1e3 * place).tolist(),
         },
@@ -375,7 +376,7 @@ def _tumour(outcome: Outcome, centre: NDArray[np.float64]) -> dict[str, Any]:
     if len(faces) and not np.any(outcome.field[_rim(faces)]):
         added = reached - 4 / 3 * math.pi * outcome.metadata["tumour"]["seed_radius_m"] ** 3
         pushed = enclosed_volume(model.points, faces) - enclosed_volume(model.points + outcome.field, faces)
-        compressed = float((model.domain_volumes * (1 - outcome.jacobian[len(model.hexahedra) :])).sum())
+        compressed = float((model.domain_volumes * (1 - outcome.jacobian[model.cells_of("support domains")])).sum())
         report["volume_balance"] = {
             "tumour_added_mm3": 1e9 * added,
             "pushed_through_interface_mm3": 1e9 * pushed,

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled.cells import hexahedra
 from mpitled.laws import first_piola
 from mpitled.store import PartRows
 
@@ -36,9 +35,7 @@ def cauchy(rows: PartRows, u: NDArray[np.float64], rule: str) -> NDArray[np.floa
 def _gradients(rows: PartRows, rule: str) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.float64]]]:
     """First cell, local nodes (n, k) and gradients (n, k, 3), 1/m, of cells block by block."""
     points = rows.read("points")
-    for first, nodes in rows.blocks("hexahedra"):
-        cells = rows.local(nodes)
-        yield first, cells, hexahedra.geometry(points, cells, rule)[0]
-    for first, nodes in rows.blocks("domains"):
-        gradients = rows.read("domain_gradients", first, first + len(nodes))
-        yield rows.n_own_hexahedra + first, rows.local(nodes), gradients
+    for block in rows.blocks:
+        for first, nodes in block.chunks("nodes"):
+            cells = rows.local(nodes)
+            yield block.first_own + first, cells, block.gradients(points, cells, first, rule)

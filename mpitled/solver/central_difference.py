@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mpitled import kernels
 from mpitled.errors import InputError
+from mpitled.model import ModelFigures
 from mpitled.parallel.halo import Halo, World
 from mpitled.solver.integrator import Integrator
 from mpitled.terms import Figure, Scene, Side
@@ -57,13 +57,13 @@ class CentralDifference(Integrator):
     shortest_interval: int = replicated(control=True, default=1)
     longest_interval: int = replicated(control=True, default=1)
 
-    def __init__(self, scene: Scene, frames: int, world: World, halo: Halo | None, model: dict[str, Any]) -> None:
+    def __init__(self, scene: Scene, frames: int, world: World, halo: Halo | None, model: ModelFigures) -> None:
         """model: figures of the model. See `Integrator`."""
         super().__init__(scene, frames, world, halo, scene.solver.load_time)
         solver = self.solver
         self.recovers = solver.on_inversion == "recover"
         self.scales_mass = solver.mass_scaling and scene.method is Method.QUASI_STATIC
-        self.critical_step_by_bound = model["critical_step_typical_s"]
+        self.critical_step_by_bound = model.critical_step_typical_s
         self.end = solver.load_time + solver.hold_time
         self.frame_span = self.end / frames
         self.held = self.sub.held

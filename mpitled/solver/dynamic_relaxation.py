@@ -97,7 +97,7 @@ class DynamicRelaxation(Integrator):
     @staticmethod
     def mass_components(sub: Subdomain) -> int:
         """See `Integrator`: tensors if the model has support domains."""
-        return 6 if sub.rows.n_domains else 1
+        return 6 if any(block.kind.meshfree for block in sub.rows.blocks) else 1
 
     def _load_steps(self) -> float:
         """Steps in which the load grows. Collective.

@@ -53,7 +53,7 @@ def run_figures(
     computing = sum(term_seconds.get(name, 0.0) for name in of_cells)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     hexahedra, domains, halo_shares, computed, peaks = world.gather(
-        [rows.n_own_hexahedra, rows.n_own_domains, halo_seconds / loop, computing, peak]
+        [rows.n_own("hexahedra"), rows.n_own("support domains"), halo_seconds / loop, computing, peak]
     ).T
     ledger = monitor.ledger
     figures = monitor.figures or dict.fromkeys((*(f.name for f in ledger.figures), *RATIOS), float("nan"))

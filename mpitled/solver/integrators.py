@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
+from mpitled.model import ModelFigures
 from mpitled.parallel.halo import Halo, World
 from mpitled.solver.central_difference import CentralDifference
 from mpitled.solver.dynamic_relaxation import DynamicRelaxation
@@ -24,7 +24,7 @@ def no_halos(components: int, precision: type[np.floating]) -> None:
 
 
 def make_integrator(
-    scene: Scene, frames: int, world: World, model: dict[str, Any], halos: Halos = no_halos
+    scene: Scene, frames: int, world: World, model: ModelFigures, halos: Halos = no_halos
 ) -> Integrator:
     """The integrator of the scene's method, at rest. model: figures of the model. Collective."""
     if scene.method is Method.RELAXATION:

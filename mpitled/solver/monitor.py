@@ -144,13 +144,12 @@ class Monitor:
     def _describe(self, cell: int) -> tuple[str, NDArray[np.int64]]:
         """Kind, number, material and place of a cell of this rank, and its local nodes (k,)."""
         rows = self.sub.rows
-        hexahedron = cell < rows.n_own_hexahedra
-        kind, k = ("hexahedra", cell) if hexahedron else ("domains", cell - rows.n_own_hexahedra)
-        local = rows.local(rows.read(kind, k, k + 1)[0])
-        centre = rows.read("points")[local].mean(axis=0) if hexahedron else rows.read("domain_points", k, k + 1)[0]
+        block, k = rows.find_cell(cell)
+        local = rows.local(block.read("nodes", k, k + 1)[0])
+        centre = block.read("points", k, k + 1)[0] if block.kind.meshfree else rows.read("points")[local].mean(axis=0)
         x, y, z = 1e3 * centre
         number, material = (rows.read(name, cell, cell + 1)[0] for name in ("cells", "material"))
         return (
-            f"{'hexahedron' if hexahedron else 'support domain'} {number} ({rows.materials[material].name}) at "
+            f"{block.kind.singular} {number} ({rows.materials[material].name}) at "
             f"({x:.1f}, {y:.1f}, {z:.1f}) mm on rank {self.world.rank}"
         ), local

@@ -70,11 +70,11 @@ class Output:
     def write(self, integrator: Integrator, figures: Mapping[str, float], frame_time: float) -> None:
         """Write the present state as a frame. Collective."""
         sub, u = self._sub, integrator.state.u[:, : self._sub.n_nodes]
-        at_points = np.einsum("ga,cga->gc", sub.domain_shapes, u[:, sub.domain_nodes])
         displacement = field = self._owned(u)
-        if sub.rows.n_domains:
-            field = np.concatenate([self._owned(self._field(u)), at_points])
-            displacement = np.concatenate([displacement, at_points])
+        if sub.clouds:
+            at_points = [np.einsum("ga,cga->gc", shapes, u[:, nodes]) for nodes, shapes in sub.clouds]
+            field = np.concatenate([self._owned(self._field(u)), *at_points])
+            displacement = np.concatenate([displacement, *at_points])
         of_cells: dict[str, NDArray[np.floating]] = {"J": integrator.stability.jacobian[:-1]}
         if self._deck.output.stress:
             of_cells["stress"] = cauchy(sub.rows, u, self._deck.hexahedra.gradient)
@@ -91,9 +91,8 @@ class Output:
         """The field u_h (3, n_nodes), m: at EFG nodes the MLS interpolation of one domain, not the parameter."""
         rows = self._sub.rows
         field = np.where(rows.owned & (rows.nodes < rows.n_fe_nodes), u, 0.0)
-        domains = rows.read("cells", rows.n_own_hexahedra) - rows.n_hexahedra
-        giving = self._sub.domain_nodes[np.searchsorted(domains, rows.field_domains)]
-        field[:, rows.local(rows.field_nodes)] = np.einsum("ga,cga->cg", rows.field_shapes, u[:, giving])
+        at_field_nodes = np.einsum("ga,cga->cg", rows.field_shapes, u[:, self._sub.field_domains])
+        field[:, rows.local(rows.field_nodes)] = at_field_nodes
         if self._halo is not None:
             self._halo.sum(field)
         return field

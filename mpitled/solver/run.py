@@ -20,6 +20,7 @@ from mpitled import deck as decks
 from mpitled import resources, store
 from mpitled.deck import Deck
 from mpitled.errors import InputError, InterruptedRun, MpitledError, UnstableError, everywhere
+from mpitled.model import ModelFigures
 from mpitled.model.loading import sphere_radius
 from mpitled.parallel.halo import Halo, World
 from mpitled.parallel.subdomain import Subdomain
@@ -61,7 +62,7 @@ class Run:
         directory: Path,
         world: World,
         sub: Subdomain,
-        model: dict[str, float],
+        model: ModelFigures,
         phases: Phases,
         quiet: bool,
         about: dict[str, Any],
@@ -94,7 +95,7 @@ class Run:
             scene, self.deck.output.frames, self.world, self.model, self._halo
         )
         name = self.deck.path.name
-        self.monitor = Monitor(self.world, self.integrator, self.model["volume_m3"], name, _remedy(self.deck))
+        self.monitor = Monitor(self.world, self.integrator, self.model.volume_m3, name, _remedy(self.deck))
 
     def _use_relaxation(self) -> None:
         """Go on with a relaxation, whatever the method of the deck."""

@@ -1,4 +1,4 @@
-"""Every HDF5 layout: the model, its partitions, the results as VTKHDF, and checkpoints; all with checksums."""
+"""All HDF5 file layouts, with checksums: models, their partitions, results as VTKHDF, and checkpoints."""
 
 from mpitled.store.checkpoints import (
     CHECKPOINTS,
@@ -11,12 +11,12 @@ from mpitled.store.checkpoints import (
 from mpitled.store.columns import read_grid, table_contents, write_columns
 from mpitled.store.files import check_hdf5, has_mpi, hdf5_version, read_rows
 from mpitled.store.models import (
-    MODEL_ARRAYS,
     check_model,
     describe_model,
+    model_arrays,
     model_contents,
     model_key,
-    read_cells,
+    read_blocks,
     read_figures,
     read_model,
     read_points,
@@ -26,7 +26,8 @@ from mpitled.store.models import (
     write_model,
 )
 from mpitled.store.partitions import (
-    BLOCK,
+    CHUNK_ROWS,
+    PartBlock,
     PartRows,
     has_partition,
     partition_mark,
@@ -37,10 +38,10 @@ from mpitled.store.results import EFG_NODE, Result, is_finished, is_result, is_u
 from mpitled.store.writer import ResultWriter, result_bytes
 
 __all__ = [
-    "BLOCK",
     "CHECKPOINTS",
+    "CHUNK_ROWS",
     "EFG_NODE",
-    "MODEL_ARRAYS",
+    "PartBlock",
     "PartRows",
     "Result",
     "ResultWriter",
@@ -56,11 +57,12 @@ __all__ = [
     "is_finished",
     "is_result",
     "is_unfinished",
+    "model_arrays",
     "model_contents",
     "model_key",
     "open_result",
     "partition_mark",
-    "read_cells",
+    "read_blocks",
     "read_checkpoint",
     "read_figures",
     "read_grid",

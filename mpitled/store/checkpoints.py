@@ -1,4 +1,4 @@
-"""The layout of checkpoints."""
+"""The file layout of checkpoints."""
 
 from __future__ import annotations
 
@@ -15,12 +15,11 @@ from mpitled import checksum, hdf5_validation
 from mpitled.errors import InputError, damaged
 from mpitled.store.files import (
     AGAIN,
-    Slabs,
     attribute,
-    check_room,
+    check_free_space,
     collective,
     create,
-    first_broken,
+    first_damaged,
     fsync,
     make,
     matching,
@@ -34,7 +33,7 @@ from mpitled.store.files import (
 from mpitled.store.partitions import PartRows
 
 #: Checkpoints of another layout are refused.
-CHECKPOINT_LAYOUT = 1
+CHECKPOINT_LAYOUT = 2
 #: The last checkpoint of a run, and the one before it.
 CHECKPOINTS = ("checkpoint.h5", "checkpoint.previous.h5")
 
@@ -43,40 +42,42 @@ def write_checkpoint(
     directory: Path,
     comm: Any,
     part: PartRows,
-    told: Mapping[str, Any],
+    metadata: Mapping[str, Any],
     nodal: Mapping[str, NDArray[np.floating]],
     own: Sequence[float],
 ) -> None:
-    """Write a checkpoint, whole and on the disc before it takes the place of the last, which becomes the one before.
+    """Write a checkpoint. Once it is on disc it replaces the last one, which is renamed.
 
-    Collective. told: what JSON can hold, rank 0's; nodal: (n owned nodes, components) by name; own: numbers of this
-    rank. InputError if it cannot be written.
+    Collective. metadata: a value that JSON can hold, of rank 0; nodal: (n owned nodes, components) by name; own:
+    numbers of this rank. InputError if it cannot be written.
     """
     if comm is not None and comm.size == 1:
         comm = None
     path, previous = (Path(directory) / name for name in CHECKPOINTS)
     new = path.with_name(f".{path.name}")
-    slabs, transfer, shares = [(part.first_row, int(part.owned.sum()))], collective(comm), {}
+    transfer, shares = collective(comm), dict[str, int]()
     with writing(path):
         if part.part == 0:
             components = sum(values.shape[1] for values in nodal.values())
-            check_room(path, 8 * part.n_nodes * (1 + components) + 8 * part.n_parts * len(own) + len(str(told)))
-        # The latest format has checksums of its own for what is not data.
+            check_free_space(
+                path, 8 * part.n_nodes * (1 + components) + 8 * part.n_parts * len(own) + len(str(metadata))
+            )
+        # The latest format has checksums of its own for metadata.
         with create(new, comm, libver="latest") as file:
             file.attrs["layout"] = CHECKPOINT_LAYOUT
 
-            def write(name: str, n_rows: int, slabs: Slabs, values: NDArray[Any]) -> None:
+            def write(name: str, n_rows: int, first: int, values: NDArray[Any]) -> None:
                 made = make(file, name, (n_rows, *values.shape[1:]), values.dtype)
-                shares[name] = write_rows(made, slabs, [values], 0, transfer)
+                shares[name] = write_rows(made, first, values, 0, transfer)
 
-            write("node", part.n_nodes, slabs, part.nodes[part.owned])
+            write("node", part.n_nodes, part.first_row, part.nodes[part.owned])
             for name, values in nodal.items():
-                write(f"nodal/{name}", part.n_nodes, slabs, values)
-            write("own", part.n_parts, [(part.part, 1)], np.array([own], np.float64))
+                write(f"nodal/{name}", part.n_nodes, part.first_row, values)
+            write("own", part.n_parts, part.part, np.array([own], np.float64))
             every = [shares] if comm is None else comm.allgather(shares)
             for name in shares:
                 file[name].attrs["checksum"] = checksum.total(of_rank[name] for of_rank in every)
-            write_json(file, "told", dict(told) if comm is None else comm.bcast(dict(told)))
+            write_json(file, "metadata", dict(metadata) if comm is None else comm.bcast(dict(metadata)))
             file.flush()
         fsync(new)
         if comm is not None:
@@ -91,32 +92,32 @@ def write_checkpoint(
 
 
 def is_checkpoint(path: Path) -> bool:
-    """Whether the HDF5 file is a checkpoint, of whatever layout; InputError if it is no HDF5 file."""
+    """Whether the HDF5 file is a checkpoint, of any layout. InputError if it is not HDF5."""
     with open_file(path) as file, damaged(path, AGAIN):
         hdf5_validation.check_file(file, path, numbers=True)
-        return "told" in file and "node" in file
+        return "metadata" in file and "node" in file
 
 
 def checkpoint_contents(path: Path) -> dict[str, Any]:
-    """What a checkpoint tells. Reads all of it; InputError if it is none of this layout, or not what was written."""
+    """The metadata of a checkpoint. Reads all of it. InputError if it is damaged, or not of this layout."""
     with open_file(path) as file, damaged(path, AGAIN):
         hdf5_validation.check_file(file, path, numbers=True)
-        layout = attribute(file, "layout") if "told" in file and "node" in file else None
-        if layout == CHECKPOINT_LAYOUT and (broken := first_broken(file)) is None:
-            return dict(read_json(file, "told"))
+        layout = attribute(file, "layout") if "metadata" in file and "node" in file else None
+        if layout == CHECKPOINT_LAYOUT and (name := first_damaged(file)) is None:
+            return dict(read_json(file, "metadata"))
     if layout is None:
         raise InputError(f"{path}: is not a checkpoint of mpitled")
     if layout != CHECKPOINT_LAYOUT:
         raise InputError(f"{path}: has layout {layout}, this version reads {CHECKPOINT_LAYOUT}; begin anew")
-    raise InputError(f"{path}: is damaged: {broken} is not what was written")
+    raise InputError(f"{path}: is damaged: {name} is not what was written")
 
 
 def read_checkpoint(
     path: Path, nodes: NDArray[np.int64]
 ) -> tuple[dict[str, NDArray[np.floating]], NDArray[np.float64]]:
-    """What a checkpoint holds of the nodes (ascending), (n nodes, components) by name; the numbers of each rank.
+    """The nodal fields (n nodes, components) of a checkpoint by name, at nodes (ascending); the numbers of each rank.
 
-    Of a file that `checkpoint_contents` has read.
+    The file has to be one that `checkpoint_contents` has read.
     """
     with open_file(path) as file, damaged(path, AGAIN):
         hdf5_validation.check_file(file, path, numbers=True)
@@ -130,10 +131,10 @@ def read_checkpoint(
 
 
 def discard_checkpoints(directory: Path) -> bool:
-    """Remove the checkpoints of a run, if there are any: whether there were."""
+    """Remove the checkpoints of a run, if there are any; whether there were."""
     paths = [Path(directory) / name for name in (f".{CHECKPOINTS[0]}", *CHECKPOINTS)]
-    there = [path for path in paths if path.exists()]
-    for path in there:
+    found = [path for path in paths if path.exists()]
+    for path in found:
         with writing(path):
             path.unlink()
-    return bool(there)
+    return bool(found)

@@ -1,143 +1,148 @@
-"""The layout of models."""
+"""The file layout of models."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict, fields
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from mpitled import hdf5_validation
+from mpitled.cells.kind import KINDS, CellKind
 from mpitled.errors import InputError, damaged
 from mpitled.laws import Material, material_of
-from mpitled.model import Model
+from mpitled.model import CellBlock, Model, ModelFigures
 from mpitled.store.files import (
     REBUILD,
     attribute,
-    check_room,
-    first_broken,
+    check_free_space,
+    first_damaged,
     open_file,
     put,
+    read_checked,
     read_json,
     replacing,
-    whole,
     write_json,
 )
 
-#: Written into every model; a file of another layout is built anew, never read by guess.
+#: Version of the layout. A model of another layout is rebuilt, never read.
 MODEL_LAYOUT = 3
-MODEL_ARRAYS = {
-    "points": np.float64,
-    "node_ids": np.int64,
-    "hexahedra": np.int64,
-    "domains": np.int64,
-    "domain_points": np.float64,
-    "domain_volumes": np.float64,
-    "domain_gradients": np.float64,
-    "domain_shapes": np.float64,
-    "field_domains": np.int64,
-    "field_shapes": np.float64,
-    "material": np.int16,
-    "mass": np.float64,
-    "prescribed_dofs": np.int64,
-    "prescribed_displacements": np.float64,
-    "prescribed_turns": np.float64,
+#: Arrays at the top of the file: type, and lengths by name or number. Kernels index without further checks.
+MODEL_ARRAYS: dict[str, tuple[type[np.generic], tuple[str | int, ...]]] = {
+    "points": (np.float64, ("nodes", 3)),
+    "node_ids": (np.int64, ("nodes",)),
+    "field_domains": (np.int64, ("efg_nodes",)),
+    "field_shapes": (np.float64, ("efg_nodes", "n_field")),
+    "mass": (np.float64, ("nodes",)),
+    "prescribed_dofs": (np.int64, ("dofs",)),
+    "prescribed_displacements": (np.float64, ("dofs",)),
+    "rotation_paths": (np.float64, ("dofs", 3)),
 }
-#: Their rows and columns, by name or number: kernels go where these say, and look no more.
-_MODEL_SHAPES: dict[str, tuple[str | int, ...]] = {
-    "points": ("nodes", 3),
-    "node_ids": ("nodes",),
-    "hexahedra": ("hexahedra", 8),
-    "domains": ("domains", "n"),
-    "domain_points": ("domains", 3),
-    "domain_volumes": ("domains",),
-    "domain_gradients": ("domains", "n", 3),
-    "domain_shapes": ("domains", "n"),
-    "field_domains": ("efg_nodes",),
-    "field_shapes": ("efg_nodes", "n"),
-    "material": ("cells",),
-    "mass": ("nodes",),
-    "prescribed_dofs": ("dofs",),
-    "prescribed_displacements": ("dofs",),
-    "prescribed_turns": ("dofs", 3),
-}
-#: Numbers in SI units are smaller by far.
-_LARGEST = 1e50
+#: Upper bound of numbers in SI units.
+_MAX_VALUE = 1e50
+
+
+def block_arrays(kind: CellKind) -> dict[str, tuple[type[np.generic], tuple[str | int, ...]]]:
+    """Arrays in the group of a block of that kind: types and lengths; "n" is the number of nodes per cell."""
+    columns = {name: (np.float64, ("cells", *row)) for name, row in kind.columns.items()}
+    return {"nodes": (np.int64, ("cells", kind.n_nodes or "n")), "material": (np.int16, ("cells",)), **columns}
+
+
+class BlockGroup(NamedTuple):
+    """A block of cells in an open file."""
+
+    name: str
+    kind: CellKind
+    group: h5py.Group
+    first: int  # number of its first cell
+    n_cells: int
+
+
+def model_arrays(model: Model) -> dict[str, NDArray[Any]]:
+    """The arrays of a model, by their names in the file."""
+    arrays = {name: np.asarray(getattr(model, name), dtype) for name, (dtype, _) in MODEL_ARRAYS.items()}
+    for i, block in enumerate(model.blocks):
+        of_block = {"nodes": block.nodes, "material": block.material, **block.columns}
+        for name, (dtype, _) in block_arrays(block.kind).items():
+            arrays[f"blocks/{i}/{name}"] = np.asarray(of_block[name], dtype)
+    return arrays
 
 
 def write_model(path: Path, model: Model, key: str, scene: Mapping[str, Any] | None = None) -> None:
-    """Write the model to `path` at once or not at all; `key` says what it was built from (see `model_key`).
+    """Write the model to `path`, completely or not at all; `key` identifies the input of its build (see `model_key`).
 
-    `scene` is the deck, for the export. InputError if it cannot be written.
+    `scene` is the deck, for the export. InputError if the file cannot be written.
 
-    Arrays are contiguous, so that any range of rows is one read.
+    Arrays are contiguous: any range of rows is one read.
     """
+    arrays = model_arrays(model)
     with replacing(path) as temporary, h5py.File(temporary, "w", locking=False) as file:
-        check_room(path, sum(np.asarray(getattr(model, name)).nbytes for name in MODEL_ARRAYS))
-        file.attrs["format"] = "mpitled model"
-        file.attrs["layout"] = MODEL_LAYOUT
-        file.attrs["key"] = key
-        file.attrs["n_fe_nodes"] = model.n_fe_nodes
-        for name, dtype in MODEL_ARRAYS.items():
-            put(file, name, np.asarray(getattr(model, name), dtype))
+        check_free_space(path, sum(values.nbytes for values in arrays.values()))
+        header = {"format": "mpitled model", "layout": MODEL_LAYOUT, "key": key, "n_fe_nodes": model.n_fe_nodes}
+        for name, value in (header | {"n_blocks": len(model.blocks), "field_block": model.field_block}).items():
+            file.attrs[name] = value
+        for name, values in arrays.items():
+            put(file, name, values)
+        for i, block in enumerate(model.blocks):
+            file[f"blocks/{i}"].attrs.update(name=block.name, kind=block.kind.name)
         if model.surface_areas is not None:
             put(file, "surface_areas", model.surface_areas)
         for name in ("node_sets", "cell_sets"):
             _write_sets(file.create_group(name), getattr(model, name))
         write_json(file, "materials", [material.record() for material in model.materials])
-        write_json(file, "figures", model.figures)
+        write_json(file, "figures", asdict(model.figures))
         write_json(file, "remarks", model.remarks)
         write_json(file, "scene", scene or {})
-        file.flush()  # what fails as a file is closed is not said
+        file.flush()  # errors at closing are not reported
 
 
 def read_model(path: Path) -> Model:
-    """The whole model. InputError if the file is missing, not a model, or of another layout."""
+    """The whole model. InputError if the file is missing, damaged, not a model, or of another layout."""
     with open_model(path) as file:
-        arrays = {name: whole(file[name]) for name in MODEL_ARRAYS}
-        n_nodes, n_domains, n_cells = len(file["points"]), len(file["domains"]), len(file["material"])
-        node_sets, cell_sets, materials = (
-            _read_sets(file["node_sets"]),
-            _read_sets(file["cell_sets"]),
-            read_materials(file),
-        )
+        arrays = {name: read_checked(file[name]) for name in MODEL_ARRAYS}
+        n_nodes, materials, blocks = len(file["points"]), read_materials(file), _read_blocks(file)
+        node_sets, cell_sets = _read_sets(file["node_sets"]), _read_sets(file["cell_sets"])
         check_finite(arrays)
-        ends = {"hexahedra": n_nodes, "domains": n_nodes, "field_domains": n_domains, "material": len(materials)}
-        for name, end in (ends | {"prescribed_dofs": 3 * n_nodes}).items():
-            check_numbers(arrays[name], end, name)
-        for sets, end in ((node_sets, n_nodes), (cell_sets, n_cells)):
+        for block in blocks:
+            check_finite(block.columns)
+            check_range(block.material, len(materials), f"material of {block.name}")
+        field_block = str(attribute(file, "field_block"))
+        n_domains = next((len(block) for block in blocks if block.name == field_block), 0)
+        for name, end in (("field_domains", n_domains), ("prescribed_dofs", 3 * n_nodes)):
+            check_range(arrays[name], end, name)
+        for sets, end in ((node_sets, n_nodes), (cell_sets, sum(map(len, blocks)))):
             for name, members in sets.items():
-                check_numbers(members, end, name)
+                check_range(members, end, name)
         return Model(
             **arrays,
             n_fe_nodes=int(file.attrs["n_fe_nodes"]),
+            blocks=blocks,
+            field_block=field_block,
             node_sets=node_sets,
             cell_sets=cell_sets,
-            surface_areas=whole(file["surface_areas"]) if "surface_areas" in file else None,
+            surface_areas=read_checked(file["surface_areas"]) if "surface_areas" in file else None,
             materials=materials,
             figures=_read_figures(file),
             remarks=_read_remarks(file),
         )
 
 
-def read_cells(path: Path) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Hexahedra (n, 8), support domains (m, k) and their points (m, 3), m: all that a partition is made from."""
+def read_blocks(path: Path) -> tuple[CellBlock, ...]:
+    """The blocks of cells: input of a partition."""
     with open_model(path) as file:
-        hexahedra, domains = whole(file["hexahedra"]), whole(file["domains"])
-        for cells in (hexahedra, domains):
-            check_numbers(cells, len(file["points"]), "cells")
-        return hexahedra, domains, whole(file["domain_points"])
+        return _read_blocks(file)
 
 
 def read_points(path: Path) -> NDArray[np.float64]:
-    """Places (n_nodes, 3), m, of the nodes."""
+    """Positions (n_nodes, 3), m, of the nodes."""
     with open_model(path) as file:
-        return np.asarray(whole(file["points"]), np.float64)
+        return np.asarray(read_checked(file["points"]), np.float64)
 
 
 def model_key(path: Path) -> str | None:
@@ -150,10 +155,10 @@ def model_key(path: Path) -> str | None:
 
 
 def check_model(path: Path) -> None:
-    """Read all of the model; InputError names what does not have the checksum that it was written with."""
+    """Read all of the model. InputError names the dataset with a wrong checksum."""
     with open_model(path) as file:
-        if broken := first_broken(file):
-            raise InputError(f"{path}: is damaged: {broken} is not what was written")
+        if name := first_damaged(file):
+            raise InputError(f"{path}: is damaged: {name} is not what was written")
 
 
 def read_sets(path: Path) -> tuple[dict[str, NDArray[np.int64]], dict[str, NDArray[np.int64]]]:
@@ -162,8 +167,8 @@ def read_sets(path: Path) -> tuple[dict[str, NDArray[np.int64]], dict[str, NDArr
         return _read_sets(file["node_sets"]), _read_sets(file["cell_sets"])
 
 
-def read_figures(path: Path) -> dict[str, Any]:
-    """What the preprocessor counted and measured, by name."""
+def read_figures(path: Path) -> ModelFigures:
+    """Numbers that were counted and measured when the model was built."""
     with open_model(path) as file:
         return _read_figures(file)
 
@@ -175,7 +180,7 @@ def read_scene(path: Path) -> dict[str, Any]:
 
 
 def read_remarks(path: Path) -> list[str]:
-    """What the readers and meshers skipped, repaired or took for granted, a line each."""
+    """What the readers and meshers skipped, repaired or assumed, a line each."""
     with open_model(path) as file:
         return list(_read_remarks(file))
 
@@ -183,40 +188,44 @@ def read_remarks(path: Path) -> list[str]:
 def model_contents(path: Path) -> dict[str, Any]:
     """Sizes, sets, materials and figures of a model, as JSON can hold them."""
     with open_model(path) as file:
+        blocks = [
+            {
+                "name": block.name,
+                "kind": block.kind.name,
+                "cells": block.n_cells,
+                "nodes": block.group["nodes"].shape[1],
+            }
+            for block in block_groups(file)
+        ]
         return {
             "nodes": len(file["points"]),
             "fe_nodes": int(file.attrs["n_fe_nodes"]),
-            "hexahedra": len(file["hexahedra"]),
-            "support_domains": len(file["domains"]),
-            "domain_nodes": file["domains"].shape[1],
+            "blocks": blocks,
             "prescribed_dofs": len(file["prescribed_dofs"]),
             "materials": [material.record() for material in read_materials(file)],
             "node_sets": {name: len(members) for name, members in _read_sets(file["node_sets"]).items()},
             "cell_sets": {name: len(members) for name, members in _read_sets(file["cell_sets"]).items()},
-            "figures": _read_figures(file),
+            "figures": _read_figures(file).flat(),
             "remarks": list(_read_remarks(file)),
         }
 
 
 def describe_model(path: Path) -> str:
     """The contents of a model, a line each."""
-    has = model_contents(path)
-    lines = [
-        f"nodes            {has['nodes']} ({has['fe_nodes']} FE)",
-        f"hexahedra        {has['hexahedra']}",
-        f"support domains  {has['support_domains']} of {has['domain_nodes']} nodes",
-        f"prescribed dofs  {has['prescribed_dofs']}",
-    ]
-    lines += [f"material         {material_of(record).describe()}" for record in has["materials"]]
+    contents = model_contents(path)
+    lines = [f"nodes            {contents['nodes']} ({contents['fe_nodes']} FE)"]
+    lines += [f"{block['name']:16} {block['cells']} of {block['nodes']} nodes" for block in contents["blocks"]]
+    lines.append(f"prescribed dofs  {contents['prescribed_dofs']}")
+    lines += [f"material         {material_of(record).describe()}" for record in contents["materials"]]
     for kind in ("node_sets", "cell_sets"):
-        lines += [f"{kind[:-1].replace('_', ' '):16} {name}: {n}" for name, n in has[kind].items()]
-    lines += [f"{name}: {value:.6g}" for name, value in has["figures"].items()]
-    return "\n".join([*lines, *has["remarks"]])
+        lines += [f"{kind[:-1].replace('_', ' '):16} {name}: {n}" for name, n in contents[kind].items()]
+    lines += [f"{name}: {value:.6g}" for name, value in contents["figures"].items()]
+    return "\n".join([*lines, *contents["remarks"]])
 
 
 @contextmanager
 def open_model(path: Path) -> Iterator[h5py.File]:
-    """A model, to be read, whose arrays fit each other. InputError if it is none of this layout."""
+    """A model, open for reading, with arrays of valid shapes. InputError if the file is not a model of this layout."""
     with open_file(path) as file, damaged(path, REBUILD):
         if attribute(file, "format") != "mpitled model":
             raise InputError(f"{path}: is not a model of mpitled; build the model from its deck")
@@ -227,48 +236,84 @@ def open_model(path: Path) -> Iterator[h5py.File]:
         yield file
 
 
+def block_groups(file: h5py.File) -> list[BlockGroup]:
+    """The blocks of an open model, in order. ValueError if there is a block of no known kind, or of a repeated name."""
+    n_blocks, found, first = attribute(file, "n_blocks"), list[BlockGroup](), 0
+    if not isinstance(n_blocks, int) or n_blocks < 0 or n_blocks != len(file.get("blocks", ())):
+        raise ValueError(f"n_blocks is not {len(file.get('blocks', ()))}")
+    for i in range(n_blocks):
+        group = file[f"blocks/{i}"]
+        name, kind = (str(attribute(group, key)) for key in ("name", "kind"))
+        if kind not in KINDS or name in {block.name for block in found}:
+            raise ValueError(f"block {i} has the kind {kind} and the name {name}")
+        found.append(BlockGroup(name, KINDS[kind], group, first, len(group["nodes"])))
+        first += found[-1].n_cells
+    return found
+
+
 def _check_shapes(file: h5py.File) -> None:
-    """ValueError unless the arrays of a model have the types that they are written in, and fit each other."""
+    """ValueError unless the arrays of a model have the types of the layout and agree in their lengths."""
     n_nodes, n_fe_nodes = len(file["points"]), attribute(file, "n_fe_nodes")
     if not isinstance(n_fe_nodes, int) or not 0 <= n_fe_nodes <= n_nodes:
         raise ValueError(f"n_fe_nodes is not between 0 and {n_nodes}")
-    sizes: dict[str, int] = {"efg_nodes": n_nodes - n_fe_nodes}
-    sizes["cells"] = len(file["hexahedra"]) + len(file["domains"])
-    for name, dtype in MODEL_ARRAYS.items():
-        array = file[name]
-        expected = _MODEL_SHAPES[name]
+    lengths = {"nodes": n_nodes, "efg_nodes": n_nodes - n_fe_nodes}
+    blocks = block_groups(file)
+    for block in blocks:
+        if block.name == attribute(file, "field_block"):
+            lengths["n_field"] = block.group["nodes"].shape[-1]
+        _check_arrays(block.group, block_arrays(block.kind), {})
+    if n_nodes > n_fe_nodes and "n_field" not in lengths:
+        raise ValueError("field_block is no block")
+    _check_arrays(file, MODEL_ARRAYS, lengths)
+    if "surface_areas" in file:
+        _check_arrays(file, {"surface_areas": (np.float64, ("nodes", 3))}, lengths)
+
+
+def _check_arrays(
+    group: h5py.Group, arrays: Mapping[str, tuple[type[np.generic], tuple[str | int, ...]]], lengths: dict[str, int]
+) -> None:
+    """ValueError unless arrays have these types and lengths; lengths that are not known yet are added."""
+    for name, (dtype, expected) in arrays.items():
+        array = group[name]
         fits = len(array.shape) == len(expected) and array.dtype == dtype
         if not fits or any(
-            n != (sizes.setdefault(size, n) if isinstance(size, str) else size)
-            for n, size in zip(array.shape, expected, strict=True)
+            n != (lengths.setdefault(length, n) if isinstance(length, str) else length)
+            for n, length in zip(array.shape, expected, strict=True)
         ):
-            raise ValueError(f"{name} has type {array.dtype} and shape {array.shape}")
-    areas = file.get("surface_areas")
-    if areas is not None and (areas.shape != (n_nodes, 3) or areas.dtype != np.float64):
-        raise ValueError(f"surface_areas has type {areas.dtype} and shape {areas.shape}")
+            raise ValueError(f"{array.name} has type {array.dtype} and shape {array.shape}")
 
 
-def check_numbers(numbers: NDArray[np.integer], end: int, what: str) -> None:
-    """ValueError unless all of them count something of which there are `end`."""
+def check_range(numbers: NDArray[np.integer], end: int, name: str) -> None:
+    """ValueError unless all numbers are in 0 ... end - 1."""
     if numbers.size and not 0 <= numbers.min() <= numbers.max() < end:
-        raise ValueError(f"{what} has numbers beyond 0 to {end - 1}")
+        raise ValueError(f"{name} has numbers beyond 0 to {end - 1}")
 
 
 def check_finite(arrays: Mapping[str, NDArray[Any]]) -> None:
-    """ValueError unless all numbers are there, and small enough to be squared and multiplied."""
+    """ValueError unless all real numbers are finite and small enough for products of them."""
     for name, values in arrays.items():
-        if values.dtype.kind == "f" and not (np.abs(values) < _LARGEST).all():
-            raise ValueError(f"{name} has numbers that are none, or beyond {_LARGEST:g}")
+        if values.dtype.kind == "f" and not (np.abs(values) < _MAX_VALUE).all():
+            raise ValueError(f"{name} has numbers that are not finite, or beyond {_MAX_VALUE:g}")
 
 
-def check_ascending(numbers: NDArray[np.integer], what: str) -> None:
+def check_ascending(numbers: NDArray[np.integer], name: str) -> None:
     """ValueError unless each number is larger than the one before."""
     if (np.diff(numbers) <= 0).any():
-        raise ValueError(f"{what} do not ascend")
+        raise ValueError(f"{name} do not ascend")
+
+
+def _read_blocks(file: h5py.File) -> tuple[CellBlock, ...]:
+    blocks = []
+    for block in block_groups(file):
+        nodes, material = (read_checked(block.group[name]) for name in ("nodes", "material"))
+        check_range(nodes, len(file["points"]), f"nodes of {block.name}")
+        columns = {name: read_checked(block.group[name]) for name in block.kind.columns}
+        blocks.append(CellBlock(block.name, block.kind, nodes, material, columns))
+    return tuple(blocks)
 
 
 def _write_sets(group: h5py.Group, sets: dict[str, NDArray[np.int64]]) -> None:
-    # Names go beside the numbers: a set of an input file may be called what HDF5 cannot.
+    # Names are data: HDF5 does not allow every name that an input file allows.
     write_json(group, "names", list(sets))
     members = [np.asarray(members, np.int64) for members in sets.values()]
     put(group, "offsets", np.cumsum([0, *map(len, members)], dtype=np.int64))
@@ -276,26 +321,28 @@ def _write_sets(group: h5py.Group, sets: dict[str, NDArray[np.int64]]) -> None:
 
 
 def _read_sets(group: h5py.Group) -> dict[str, NDArray[np.int64]]:
-    members, offsets = whole(group["members"]), whole(group["offsets"])
-    check_numbers(offsets, len(members) + 1, "offsets")
+    members, offsets = read_checked(group["members"]), read_checked(group["offsets"])
+    check_range(offsets, len(members) + 1, "offsets")
     slices = [members[start:stop] for start, stop in pairwise(offsets)]
     return dict(zip(read_json(group, "names"), slices, strict=True))
 
 
 def read_materials(file: h5py.File) -> tuple[Material, ...]:
-    """The materials of a model, by number. ValueError if they are none."""
+    """The materials of a model, by number. ValueError if their constants are not finite."""
     materials = tuple(material_of(record) for record in read_json(file, "materials"))
     for material in materials:
         if not np.isfinite([material.density, material.lam, material.mu, *material.law.coefficients]).all():
-            raise ValueError(f"material {material.name} has moduli that are no numbers")
+            raise ValueError(f"material {material.name} has moduli that are not finite")
     return materials
 
 
-def _read_figures(file: h5py.File) -> dict[str, float]:
-    figures = dict(read_json(file, "figures"))
-    if not all(isinstance(value, int | float) for value in figures.values()):
-        raise ValueError("figures holds what is no number")
-    return figures
+def _read_figures(file: h5py.File) -> ModelFigures:
+    found = dict(read_json(file, "figures"))
+    numbers = {**found, **found.get("of_mesh", {})}
+    numbers.pop("of_mesh", None)
+    if not all(isinstance(value, int | float | None) for value in numbers.values()):
+        raise ValueError("figures holds what is not a number")
+    return ModelFigures(**{item.name: found[item.name] for item in fields(ModelFigures) if item.name in found})
 
 
 def _read_remarks(file: h5py.File) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""The layout of partitions in a model, and what one part reads of both."""
+"""The file layout of partitions in a model, and the rows of the model that one part reads."""
 
 from __future__ import annotations
 
@@ -12,25 +12,35 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from mpitled.cells.kind import CellKind
 from mpitled.errors import InputError, damaged
 from mpitled.laws import Material
-from mpitled.store.files import REBUILD, check_room, matching, open_file, put, read_rows, replacing
-from mpitled.store.models import check_ascending, check_finite, check_numbers, open_model, read_materials
+from mpitled.store.files import REBUILD, attribute, check_free_space, matching, open_file, put, read_rows, replacing
+from mpitled.store.models import (
+    BlockGroup,
+    block_arrays,
+    block_groups,
+    check_ascending,
+    check_finite,
+    check_range,
+    open_model,
+    read_materials,
+)
 
 if TYPE_CHECKING:
     from partition import PartTables
 
 
 def write_partition(path: Path, tables: PartTables) -> None:
-    """Add the partition to the model, in place of one of as many parts.
+    """Add the partition to the model, or replace the one with as many parts.
 
-    The model is copied and the copy takes its name: HDF5 keeps no journal, so that an append cut short
-    could cost the model. Beside the tables it keeps the row of every node in the result files: owned nodes
-    of part 0 ascending, then those of part 1, and so on.
+    The model is copied and the copy replaces it: HDF5 has no journal, and an interrupted append could destroy the
+    model. Beside the tables the file stores the row of every node in the result files: owned nodes of part 0 ascending,
+    then those of part 1, and so on.
     """
     with open_model(path) as file:
         n_nodes = len(file["points"])
-    # The first of several mentions is the lowest part's, which owns the node.
+    # The lowest part, which owns the node, comes first.
     touched, first = np.unique(tables.nodes, return_index=True)
     if len(touched) != n_nodes:
         raise InputError(f"{path}: {n_nodes - len(touched)} nodes are on no part; partition the model anew")
@@ -39,9 +49,8 @@ def write_partition(path: Path, tables: PartTables) -> None:
     rows[np.argsort(owner, kind="stable")] = np.arange(n_nodes)
 
     with replacing(path) as temporary:
-        check_room(
-            path, Path(path).stat().st_size + sum(np.asarray(getattr(tables, f.name)).nbytes for f in fields(tables))
-        )
+        size = sum(np.asarray(getattr(tables, column.name)).nbytes for column in fields(tables))
+        check_free_space(path, Path(path).stat().st_size + size)
         shutil.copyfile(path, temporary)
         with h5py.File(temporary, "r+", locking=False) as file:
             name = f"partitions/{tables.n_parts}"
@@ -62,7 +71,7 @@ def has_partition(path: Path, n_parts: int) -> bool:
 
 
 def partition_mark(path: Path, n_parts: int) -> str:
-    """What tells partitions in as many parts from each other. InputError if there is none."""
+    """An identifier of the partition in so many parts. InputError if there is none."""
     with open_model(path) as file:
         if n_parts == 1:
             return "whole"
@@ -73,137 +82,182 @@ def partition_mark(path: Path, n_parts: int) -> str:
 
 #: Rows first to last of a column, in the part's order.
 Source = Callable[[str, int, int], NDArray[Any]]
-#: What each long column has a row of.
-_COLUMNS = {
-    **dict.fromkeys(("node_ids", "rows", "points", "mass"), "nodes"),
-    **dict.fromkeys(("cells", "material"), "cells"),
-    "hexahedra": "hexahedra",
-    **dict.fromkeys(("domains", "domain_points", "domain_volumes", "domain_gradients", "domain_shapes"), "domains"),
-}
-#: Rows of long columns at a time.
-BLOCK = 1 << 16
+#: Columns with a row for each node of the part.
+NODE_COLUMNS = ("node_ids", "rows", "points", "mass")
+#: Rows of a column that are read at a time.
+CHUNK_ROWS = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class PartBlock:
+    """The cells of one block that are on a part; there may be none.
+
+    Columns with a row for each of these cells: "cells", int64, ascending numbers in the model; "nodes" (.., k), int64,
+    global; "material", int16; and those of the kind, see `CellKind.columns`.
+    """
+
+    name: str
+    kind: CellKind
+    n_nodes: int  # nodes per cell, k
+    n_cells: int  # of the block in the whole model
+    n_own: int  # of the block on this part
+    first_own: int  # local number of the first of these: local cells are numbered block after block
+    source: Source
+
+    def read(self, name: str, first: int = 0, last: int | None = None) -> NDArray[Any]:
+        """Rows first to last of a column, from the file. InputError if it cannot be read any more."""
+        return self.source(name, first, self.n_own if last is None else last)
+
+    def chunks(self, name: str) -> Iterator[tuple[int, NDArray[Any]]]:
+        """A column in pieces of `CHUNK_ROWS`, each with its first row."""
+        for first in range(0, self.n_own, CHUNK_ROWS):
+            yield first, self.read(name, first, min(first + CHUNK_ROWS, self.n_own))
+
+    def gradients(self, points: NDArray[np.float64], cells: NDArray[np.integer], first: int, rule: str = "mean") -> Any:
+        """Gradients (n, k, 3), 1/m, of cells (n, k) in local nodes, rows `first` and following of the block."""
+        if self.kind.geometry:
+            return self.kind.geometry(points, cells, rule)[0]
+        return self.read("gradients", first, first + len(cells))
 
 
 @dataclass(frozen=True, slots=True)
 class PartRows:
     """The rows of the model that one part needs, in SI units and global numbers.
 
-    A cell is on one part; a node is on every part whose cells touch it, and the lowest of them owns it. The long
-    columns stay where they are until they are asked for (`read`), so that a run need not hold what it needs once:
-
-    - of `nodes`: "node_ids" (k,), numbers in the file that they came from; "rows" (k,) in the result files; "points"
-      (k, 3), m; "mass" (k,), kg, of the whole model's cells;
-    - of cells, this part's hexahedra and then its support domains: "cells" (n,) ascending; "material" (n,);
-    - "hexahedra" (n_own_hexahedra, 8), nodes;
-    - of support domains: "domains" (n_own_domains, n), nodes; "domain_points" (.., 3), m; "domain_volumes" (..,), m^3;
-      "domain_gradients" (.., n, 3), 1/m; "domain_shapes" (.., n).
+    A cell is on one part. A node is on every part with a cell that touches it; the lowest of these parts owns the node.
+    Long columns stay in the file until they are read, so that a run does not hold what it needs once. `read` gives
+    columns of `nodes`: "node_ids" (k,), numbers in the input file; "rows" (k,) in the result files; "points" (k, 3), m;
+    "mass" (k,), kg, of the whole model's cells. Columns of cells are in `blocks`; `read` gives "cells" and "material"
+    of all blocks.
     """
 
     n_parts: int
     part: int
     n_nodes: int  # of the whole model
     n_fe_nodes: int  # of the whole model
-    n_hexahedra: int  # of the whole model
-    n_domains: int  # of the whole model
-    n_own_hexahedra: int
-    n_own_domains: int
-    nodes: NDArray[np.signedinteger]  # (k,) ascending nodes that the part's cells touch; int32 as far as it goes
+    blocks: tuple[PartBlock, ...]  # all blocks of the model, in order
+    nodes: NDArray[np.signedinteger]  # (k,) ascending nodes that the part's cells touch; int32 if the numbers allow it
     owned: NDArray[np.bool_]  # (k,)
-    first_row: int  # row of the first owned node; owned nodes follow each other
+    first_row: int  # row of the first owned node; the rows of owned nodes are consecutive
     materials: tuple[Material, ...]
     prescribed_dofs: NDArray[np.int64]  # ascending 3 node + direction, on `nodes`
     prescribed_displacements: NDArray[np.float64]  # m
-    prescribed_turns: NDArray[np.float64]  # (len(prescribed_dofs), 3)
-    field_nodes: NDArray[np.int64]  # ascending EFG nodes whose field one of "domains" gives; not all in `nodes`
-    field_domains: NDArray[np.int64]  # the support domain of each, a number of the whole model
-    field_shapes: NDArray[np.float64]  # (len(field_nodes), n)
+    rotation_paths: NDArray[np.float64]  # (len(prescribed_dofs), 3)
+    field_block: str  # name of the block that interpolates the field at EFG nodes
+    field_nodes: NDArray[np.int64]  # ascending EFG nodes with a field from a cell of this part; not all in `nodes`
+    field_domains: NDArray[np.int64]  # that cell for each, a row of the block on this part
+    field_shapes: NDArray[np.float64]  # (len(field_nodes), k)
     neighbours: NDArray[np.int32]  # ascending parts that share nodes with this one
     shared: NDArray[np.int64]  # ascending nodes shared with each neighbour in turn
     shared_offsets: NDArray[np.int64]  # (len(neighbours) + 1,) into `shared`
     source: Source
 
     @property
-    def n_own_cells(self) -> int:
-        return self.n_own_hexahedra + self.n_own_domains
+    def n_cells(self) -> int:
+        """Cells of the whole model."""
+        return sum(block.n_cells for block in self.blocks)
 
-    def length(self, name: str) -> int:
-        """Rows of a column."""
-        lengths = {
-            "nodes": len(self.nodes),
-            "cells": self.n_own_cells,
-            "hexahedra": self.n_own_hexahedra,
-            "domains": self.n_own_domains,
-        }
-        return lengths[_COLUMNS[name]]
+    @property
+    def n_own_cells(self) -> int:
+        """Cells of this part."""
+        return sum(block.n_own for block in self.blocks)
+
+    def of_kind(self, kind: str) -> list[PartBlock]:
+        """The blocks of a kind."""
+        return [block for block in self.blocks if block.kind.name == kind]
+
+    def n_own(self, kind: str) -> int:
+        """Cells of a kind on this part."""
+        return sum(block.n_own for block in self.of_kind(kind))
+
+    def find_cell(self, cell: int) -> tuple[PartBlock, int]:
+        """The block of a local cell, and its row there."""
+        block = next(block for block in self.blocks if cell < block.first_own + block.n_own)
+        return block, cell - block.first_own
 
     def local(self, nodes: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Places of nodes in `nodes`, where they have to be."""
-        # Of its own type, or numpy would make `nodes` anew of the other.
+        """Local numbers of nodes of this part."""
+        # Of the same type: numpy would convert all of `nodes` otherwise.
         return np.searchsorted(self.nodes, nodes.astype(self.nodes.dtype, copy=False))
 
     def read(self, name: str, first: int = 0, last: int | None = None) -> NDArray[Any]:
-        """Rows first to last of a long column, from the file. InputError if it cannot be read any more."""
-        return self.source(name, first, self.length(name) if last is None else last)
+        """Rows first to last of a column, from the file. InputError if it cannot be read any more."""
+        if name in NODE_COLUMNS:
+            return self.source(name, first, len(self.nodes) if last is None else last)
+        last = self.n_own_cells if last is None else last
+        ranges = [(b, *np.clip([first - b.first_own, last - b.first_own], 0, b.n_own).tolist()) for b in self.blocks]
+        return np.concatenate([block.read(name, start, stop) for block, start, stop in ranges])
 
-    def blocks(self, name: str) -> Iterator[tuple[int, NDArray[Any]]]:
-        """A long column in blocks, each with its first row."""
-        length = self.length(name)
-        for first in range(0, length, BLOCK):
-            yield first, self.read(name, first, min(first + BLOCK, length))
-
-    def holding(self, **columns: NDArray[Any]) -> PartRows:
-        """The same with other columns in place of the file's."""
-
-        def source(name: str, first: int, last: int) -> NDArray[Any]:
-            return columns[name][first:last] if name in columns else self.source(name, first, last)
-
-        return replace(self, source=source)
+    def with_columns(self, **columns: NDArray[Any]) -> PartRows:
+        """The same with other columns of nodes, or of all cells, instead of those of the file."""
+        blocks = [
+            replace(b, source=_replaced(b.source, {n: v[b.first_own :][: b.n_own] for n, v in columns.items()}))
+            for b in self.blocks
+        ]
+        return replace(self, source=_replaced(self.source, columns), blocks=tuple(blocks))
 
 
-class _File:
-    """The long columns of one part in an open model; it stays open, whatever becomes of its name."""
+def _replaced(source: Source, columns: dict[str, NDArray[Any]]) -> Source:
+    def read(name: str, first: int, last: int) -> NDArray[Any]:
+        return columns[name][first:last] if name in columns else source(name, first, last)
+
+    return read
+
+
+class _PartFile:
+    """Columns of one part in an open model; the file stays open, even if another file takes its name."""
 
     def __init__(self, path: Path, n_parts: int, part: int, nodes: NDArray[np.signedinteger]) -> None:
         """nodes: of the part, ascending."""
         self._file, self._path, self._nodes = open_file(path), path, nodes
         self._group = None if n_parts == 1 else self._file[f"partitions/{n_parts}"]
-        self._n_hexahedra = len(self._file["hexahedra"])
         self._cells = slice(0, 0) if self._group is None else _range(self._group["cell_offsets"], part)
-        cells = self.numbers(0, self._cells.stop - self._cells.start)
-        self.n_own_hexahedra = int(np.searchsorted(cells, self._n_hexahedra))
-
-    def numbers(self, first: int, last: int) -> NDArray[np.int64]:
-        """Of cells of the part in the whole model."""
-        if self._group is None:
-            return np.arange(first, last)
-        return np.asarray(self._group["cells"][self._cells.start + first : self._cells.start + last], np.int64)
 
     def __call__(self, name: str, first: int, last: int) -> NDArray[Any]:
         with damaged(self._path, REBUILD):
-            if name == "cells":
-                return self.numbers(first, last)
             if self._group is None:
                 return np.arange(first, last) if name == "rows" else np.asarray(self._file[name][first:last])
-            kind, before = _COLUMNS[name], self.n_own_hexahedra
-            if kind == "nodes":
-                return read_rows((self._group if name == "rows" else self._file)[name], self._nodes[first:last])
-            if kind == "domains":
-                return read_rows(self._file[name], self.numbers(before + first, before + last) - self._n_hexahedra)
-            return read_rows(self._file[name], self.numbers(first, last))
+            return read_rows((self._group if name == "rows" else self._file)[name], self._nodes[first:last])
+
+    def blocks(self) -> tuple[PartBlock, ...]:
+        """The blocks, with the rows that are on the part."""
+        found, first_own = [], 0
+        own = None if self._group is None else self._group["cells"][self._cells]
+        for block in block_groups(self._file):
+            n_own = block.n_cells
+            if own is not None:
+                n_own = int(np.diff(np.searchsorted(own, [block.first, block.first + n_own]))[0])
+            source = self._block_source(block, first_own)
+            k = block.group["nodes"].shape[1]
+            found.append(PartBlock(block.name, block.kind, k, block.n_cells, n_own, first_own, source))
+            first_own += n_own
+        return tuple(found)
+
+    def _block_source(self, block: BlockGroup, first_own: int) -> Source:
+        start = self._cells.start + first_own
+
+        def read(name: str, first: int, last: int) -> NDArray[Any]:
+            with damaged(self._path, REBUILD):
+                if self._group is None:
+                    if name == "cells":
+                        return np.arange(block.first + first, block.first + last)
+                    return np.asarray(block.group[name][first:last])
+                cells = np.asarray(self._group["cells"][start + first : start + last], np.int64)
+                return cells if name == "cells" else read_rows(block.group[name], cells - block.first)
+
+        return read
 
 
 def read_part(path: Path, n_parts: int, part: int) -> PartRows:
-    """The rows of part `part` of `n_parts`, without holding those of others; the file stays open for `PartRows.read`.
+    """The rows of part `part` of `n_parts`. The file stays open for `PartRows.read`.
 
     InputError if the model has no such partition.
     """
     with open_model(path) as file:
-        n_nodes, n_hexahedra, n_domains = (len(file[name]) for name in ("points", "hexahedra", "domains"))
+        n_nodes, n_fe_nodes = len(file["points"]), int(file.attrs["n_fe_nodes"])
+        n_cells = sum(block.n_cells for block in block_groups(file))
         if n_parts == 1:
-            nodes = rows = _numbers(np.arange(n_nodes), n_nodes)
-            source = _File(path, n_parts, part, nodes)
-            n_own_hexahedra, n_own_cells = n_hexahedra, n_hexahedra + n_domains
-            own_domains = np.arange(n_domains)
+            nodes = rows = _narrowed(np.arange(n_nodes), n_nodes)
             first_row, end_row = 0, n_nodes
             neighbours, shared, shared_offsets = np.empty(0, np.int32), np.empty(0, np.int64), np.zeros(1, np.int64)
         else:
@@ -211,53 +265,52 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
                 raise InputError(f"{path}: has no partition in {n_parts} parts; partition the model first")
             group = file[f"partitions/{n_parts}"]
             nodes = group["nodes"][_range(group["node_offsets"], part)]
-            check_numbers(nodes, len(group["rows"]), "nodes")
+            check_range(nodes, len(group["rows"]), "nodes")
             rows = read_rows(group["rows"], nodes)
             first_row, end_row = group["owned_offsets"][part : part + 2]
             own = _range(group["neighbour_offsets"], part)
             neighbours = group["neighbours"][own]
             shared_offsets = group["shared_offsets"][own.start : own.stop + 1]
-            check_numbers(shared_offsets, len(group["shared"]) + 1, "shared_offsets")
+            check_range(shared_offsets, len(group["shared"]) + 1, "shared_offsets")
             shared = group["shared"][shared_offsets[0] : shared_offsets[-1]]
             shared_offsets = shared_offsets - shared_offsets[0]
             cells = group["cells"][_range(group["cell_offsets"], part)]
             if len(shared_offsets) != len(neighbours) + 1 or (np.diff(shared_offsets) < 0).any():
                 raise ValueError("shared_offsets do not fit the neighbours")
             for name, numbers, end in (("neighbours", neighbours, n_parts), ("rows", rows, n_nodes)):
-                check_numbers(numbers, end, name)
-            for name, numbers, end in (("cells", cells, n_hexahedra + n_domains), ("nodes", nodes, n_nodes)):
-                check_numbers(numbers, end, name)
+                check_range(numbers, end, name)
+            for name, numbers, end in (("cells", cells, n_cells), ("nodes", nodes, n_nodes)):
+                check_range(numbers, end, name)
                 check_ascending(numbers, name)
             if part in neighbours or not np.isin(shared, nodes).all():
                 raise ValueError("a part shares with itself, or nodes that are not its own")
-            nodes = _numbers(nodes, n_nodes)
-            source = _File(path, n_parts, part, nodes)
-            n_own_hexahedra, n_own_cells = source.n_own_hexahedra, len(cells)
-            own_domains = cells[n_own_hexahedra:] - n_hexahedra
-
+            nodes = _narrowed(nodes, n_nodes)
+        source = _PartFile(path, n_parts, part, nodes)
+        blocks, field_block = source.blocks(), str(attribute(file, "field_block"))
+        own_domains = np.empty(0, np.int64)
+        for block, stored in zip(blocks, block_groups(file), strict=True):
+            if block.name == field_block:
+                own_domains = block.read("cells") - stored.first
         dofs, prescribed = matching(file["prescribed_dofs"], nodes, 3)
-        field_domains, fields_here = matching(file["field_domains"], own_domains, 1)
-        n_fe_nodes = int(file.attrs["n_fe_nodes"])
+        field_domains, with_field = matching(file["field_domains"], own_domains, 1)
         check_ascending(dofs, "prescribed_dofs")
         part_rows = PartRows(
             n_parts=n_parts,
             part=part,
             n_nodes=n_nodes,
             n_fe_nodes=n_fe_nodes,
-            n_hexahedra=n_hexahedra,
-            n_domains=n_domains,
-            n_own_hexahedra=n_own_hexahedra,
-            n_own_domains=n_own_cells - n_own_hexahedra,
+            blocks=blocks,
             nodes=nodes,
             owned=(rows >= first_row) & (rows < end_row),
             first_row=int(first_row),
             materials=read_materials(file),
             prescribed_dofs=dofs,
             prescribed_displacements=read_rows(file["prescribed_displacements"], prescribed),
-            prescribed_turns=read_rows(file["prescribed_turns"], prescribed),
-            field_nodes=n_fe_nodes + fields_here,
-            field_domains=field_domains,
-            field_shapes=read_rows(file["field_shapes"], fields_here),
+            rotation_paths=read_rows(file["rotation_paths"], prescribed),
+            field_block=field_block,
+            field_nodes=n_fe_nodes + with_field,
+            field_domains=np.searchsorted(own_domains, field_domains),
+            field_shapes=read_rows(file["field_shapes"], with_field),
             neighbours=neighbours,
             shared=shared,
             shared_offsets=shared_offsets,
@@ -268,24 +321,28 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
         return part_rows
 
 
-def _numbers(nodes: NDArray[np.int64], n_nodes: int) -> NDArray[np.signedinteger]:
-    """In half the room where a model has no more than 2^31 nodes."""
+def _narrowed(nodes: NDArray[np.int64], n_nodes: int) -> NDArray[np.signedinteger]:
+    """Node numbers in half the memory where a model has no more than 2^31 nodes."""
     return nodes.astype(np.int32) if n_nodes <= np.iinfo(np.int32).max else nodes
 
 
 def _check_columns(part: PartRows) -> None:
-    """ValueError unless the long columns hold what they may."""
-    for name in _COLUMNS:
-        for _, values in part.blocks(name):
-            if name in ("hexahedra", "domains"):
-                # As `localise` will find them: a node of which this part has no copy would be beyond its arrays.
-                check_numbers(values, part.n_nodes, name)
-                if not (part.nodes.take(part.local(values), mode="clip") == values).all():
-                    raise ValueError(f"{name} have nodes that their part has not")
-            elif name == "material":
-                check_numbers(values, len(part.materials), name)
-            else:
-                check_finite({name: values})
+    """ValueError unless the long columns hold valid numbers."""
+    for name in NODE_COLUMNS:
+        for first in range(0, len(part.nodes), CHUNK_ROWS):
+            check_finite({name: part.read(name, first, min(first + CHUNK_ROWS, len(part.nodes)))})
+    for block in part.blocks:
+        for name in ("cells", *block_arrays(block.kind)):
+            for _, values in block.chunks(name):
+                if name == "nodes":
+                    # A node that is not on this part would be an index beyond its arrays.
+                    check_range(values, part.n_nodes, f"nodes of {block.name}")
+                    if not (part.nodes.take(part.local(values), mode="clip") == values).all():
+                        raise ValueError(f"{block.name} have nodes that their part does not have")
+                elif name == "material":
+                    check_range(values, len(part.materials), f"material of {block.name}")
+                else:
+                    check_finite({name: values})
 
 
 def _range(offsets: h5py.Dataset, part: int) -> slice:

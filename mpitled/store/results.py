@@ -1,35 +1,51 @@
-"""The layout of results, VTKHDF with checksums beside it, as it is read."""
+"""The file layout of results (VTKHDF, and checksums beside it), and reading them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from mpitled import checksum, hdf5_validation
+from mpitled.cells.kind import KINDS, CellKind
 from mpitled.errors import InputError, damaged
-from mpitled.store.files import AGAIN, attribute, checksum_of, first_broken, matching, open_file, read_json, read_rows
+from mpitled.store.files import AGAIN, attribute, checksum_of, first_damaged, matching, open_file, read_json, read_rows
 
 #: Results of another layout are refused.
-RESULT_LAYOUT = 2
+RESULT_LAYOUT = 3
 FINISHED, UNFINISHED = "result.vtkhdf", "result.partial.vtkhdf"
-#: Of what is in a result, as the attribute "units" of its dataset says too; decks and reports are in mm.
+#: Units of the data, also in the attribute "units" of the datasets; decks and reports are in mm.
 UNITS = {"Points": "m", "displacement": "m", "parameters": "m", "stress": "Pa", "Values": "s"}
-HEXAHEDRON, EFG_NODE, INTEGRATION_POINT = 0, 1, 2
+#: Cell data "kind" of the vertices of EFG nodes; blocks have `CellKind.code`.
+EFG_NODE = 1
+
+
+class ResultBlock(NamedTuple):
+    """A block of cells in a result."""
+
+    name: str
+    kind: CellKind
+    cells: int
+    nodes: int  # per cell
+
+
+def in_file_order(blocks: Sequence[Any]) -> list[Any]:
+    """Blocks with faces, None for the vertices of EFG nodes, and mesh-free blocks."""
+    return [*(b for b in blocks if not b.kind.meshfree), None, *(b for b in blocks if b.kind.meshfree)]
 
 
 def series_of(time: float, series: Mapping[str, float]) -> NDArray[np.float64]:
-    """The time and the numbers of a frame, as their checksum has them."""
+    """The time and the numbers of a frame, in the order of their checksum."""
     return np.array([time, *(series[name] for name in sorted(series))], np.float64)
 
 
 class Result:
-    """The results of a run, read as they are asked for: the grid as it is in the file, or in the model's order.
+    """The results of a run, read on demand: the grid in the order of the file, or in the order of the model.
 
     Use it `with damaged` where the file may come from others.
     """
@@ -39,7 +55,7 @@ class Result:
 
     @cached_property
     def _of_mesh(self) -> dict[str, int]:
-        """Checksums of what is the same in every frame."""
+        """Checksums of the datasets that are the same in every frame."""
         return dict(read_json(self._file["mpitled"], "mesh_checksums"))
 
     def __enter__(self) -> Result:
@@ -50,22 +66,22 @@ class Result:
 
     @property
     def complete(self) -> bool:
-        """Whether the run came to its end."""
+        """Whether the run finished."""
         return ".partial" not in self.path.suffixes
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """What the run was started with."""
+        """The metadata that the run was started with."""
         return read_json(self._file["mpitled"], "metadata")
 
     @property
     def figures(self) -> dict[str, Any]:
-        """What the run ended with; empty if it was killed."""
+        """The figures that the run ended with; empty if it was killed."""
         return read_json(self._file["mpitled"], "figures") if "figures" in self._file["mpitled"] else {}
 
     def check(self) -> None:
-        """Read all of the file; InputError names what does not have the checksum that it was written with."""
-        broken = first_broken(self._file)
+        """Read all of the file. InputError names the data with a wrong checksum."""
+        broken = first_damaged(self._file)
         for name, total in self._of_mesh.items():
             if checksum_of(self._grid[name]) != total:
                 broken = broken or name
@@ -76,11 +92,11 @@ class Result:
                 if checksum_of(self._grid[name], frame * n_rows, n_rows) != totals[frame]:
                     broken = broken or f"{name} of frame {frame}"
         if broken:
-            raise self._broken(broken)
+            raise self._damaged(broken)
         _ = self._numbers
 
     def names(self, kind: str) -> list[str]:
-        """What each frame holds for each "Point" or "Cell"."""
+        """Names of the data that each frame holds for each "Point" or "Cell"."""
         return list(self._file[f"mpitled/checksums/{kind}Data"])
 
     @property
@@ -106,26 +122,59 @@ class Result:
         for frame, total in enumerate(self._file["mpitled/checksums/series"][:n]):
             numbers = series_of(times[frame], {name: values[frame] for name, values in series.items()})
             if checksum.total([checksum.share(numbers, 0)]) != total:
-                raise self._broken(f"time and energies of frame {frame}")
+                raise self._damaged(f"time and energies of frame {frame}")
         return times, series
 
     @property
     def points(self) -> NDArray[np.float64]:
         """(nodes + integration points, 3), m, undeformed."""
-        return self._whole("Points", self._grid["Points"][...])
+        return self._checked("Points", self._grid["Points"][...])
+
+    @cached_property
+    def blocks(self) -> tuple[ResultBlock, ...]:
+        """The blocks of cells, in the order of the model."""
+        return tuple(
+            ResultBlock(str(b["name"]), KINDS[b["kind"]], int(b["cells"]), int(b["nodes"]))
+            for b in read_json(self._file["mpitled"], "blocks")
+        )
+
+    def block_rows(self, name: str) -> slice:
+        """Rows of a block in the cells of the file."""
+        return self._block_ranges[name][0]
+
+    def corners(self, name: str) -> NDArray[np.int64]:
+        """(cells, corners) of a block in the order of the file, rows of `points`; of mesh-free blocks, one each."""
+        rows, corners = self._block_ranges[name]
+        return self._connectivity[corners].reshape(rows.stop - rows.start, -1)
 
     @property
     def hexahedra(self) -> NDArray[np.int64]:
         """(n_hexahedra, 8), rows of `points`."""
-        n_hexahedra = int(np.count_nonzero(self.cell_data("kind") == HEXAHEDRON))
-        return self._whole("Connectivity", self._grid["Connectivity"][...])[: 8 * n_hexahedra].reshape(-1, 8)
+        of_blocks = [self.corners(block.name) for block in self.blocks if block.kind.name == "hexahedra"]
+        return np.concatenate([np.empty((0, 8), np.int64), *of_blocks])
+
+    @cached_property
+    def _block_ranges(self) -> dict[str, tuple[slice, slice]]:
+        """Rows of the cells and of the connectivity of each block."""
+        n_efg = int(self._grid["NumberOfCells"][0]) - sum(block.cells for block in self.blocks)
+        cell = corner = 0
+        ranges = {}
+        for block in in_file_order(self.blocks):
+            cells, k = (n_efg, 1) if block is None else (block.cells, 1 if block.kind.meshfree else block.nodes)
+            ranges[block.name if block else ""] = slice(cell, cell + cells), slice(corner, corner + k * cells)
+            cell, corner = cell + cells, corner + k * cells
+        return ranges
+
+    @property
+    def _connectivity(self) -> NDArray[np.int64]:
+        return self._checked("Connectivity", self._grid["Connectivity"][...])
 
     def point_data(self, name: str, frame: int = 0) -> NDArray[Any]:
-        """Values at `points` in a frame (negative: from the last); of what does not change in any."""
+        """Values at `points` in a frame (negative: from the last), or the same in all frames."""
         return self._rows("Point", name, frame)
 
     def cell_data(self, name: str, frame: int = 0) -> NDArray[Any]:
-        """Values in cells: hexahedra, EFG nodes (nan or -1 where it is nothing of theirs), integration points."""
+        """Values in cells: blocks with faces, EFG nodes (nan or -1 where they have no value), integration points."""
         return self._rows("Cell", name, frame)
 
     @property
@@ -139,89 +188,90 @@ class Result:
 
     def at_integration_points(self, name: str, frame: int = 0) -> NDArray[Any]:
         """Point data of the integration points, in the order of the model."""
-        cell_id = self.cell_data("cell_id")[self.cell_data("kind") == INTEGRATION_POINT]
-        return self.point_data(name, frame)[self.point_data("node_id") < 0][np.argsort(cell_id)]
+        at_points = self.point_data(name, frame)[self.point_data("node_id") < 0]
+        cell_id = self.cell_data("cell_id")
+        return at_points[np.argsort(cell_id[len(cell_id) - len(at_points) :])]
 
     def in_cells(self, name: str, frame: int = 0) -> NDArray[Any]:
-        """Cell data of hexahedra and support domains, in the order of the model."""
+        """Cell data in the order of the model's cells."""
         return self.cell_data(name, frame)[_ascending(self.cell_data("cell_id"))]
 
     def find(self, numbers: str, wanted: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Where wanted (ascending) "node_id" or "cell_id" are: rows (ascending), and whose turn each wanted one is."""
+        """Rows (ascending) of the wanted (ascending) "node_id" or "cell_id", and the entry of each wanted one there."""
         kind = "Point" if numbers == "node_id" else "Cell"
         found, rows = matching(self._grid[f"{kind}Data/{numbers}"], wanted, 1)
         return np.argsort(found), rows
 
     def point_rows(self, cell_rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Rows of the integration points that are in these rows of the cells: both end with them, in the same order."""
+        """Rows of the points of mesh-free cells, from rows of the cells: both lists end with these, in one order."""
         return cell_rows - int(self._grid["NumberOfCells"][0]) + int(self._grid["NumberOfPoints"][0])
 
     def rows(self, kind: str, name: str, frame: int, rows: NDArray[np.int64]) -> NDArray[Any]:
-        """Some rows (ascending) of what a frame holds for each "Point" or "Cell"."""
+        """Some rows (ascending) of the data of a frame for each "Point" or "Cell"."""
         first = int(self._grid[f"Steps/{kind}DataOffsets/{name}"][frame])
         return read_rows(self._grid[f"{kind}Data/{name}"], first + rows)
 
     def _rows(self, kind: str, name: str, frame: int) -> NDArray[Any]:
         first = int(self._grid[f"Steps/{kind}DataOffsets/{name}"][: max(1, self.n_frames)][frame])
         values = self._grid[f"{kind}Data/{name}"][first : first + int(self._grid[f"NumberOf{kind}s"][0])]
-        return self._whole(f"{kind}Data/{name}", values, frame)
+        return self._checked(f"{kind}Data/{name}", values, frame)
 
-    def _whole(self, name: str, values: NDArray[Any], frame: int = 0) -> NDArray[Any]:
-        """Values that have the checksum that they were written with; InputError if they have not."""
+    def _checked(self, name: str, values: NDArray[Any], frame: int = 0) -> NDArray[Any]:
+        """The values. InputError if their checksum is wrong."""
         of_frames = self._file["mpitled/checksums"].get(name)
         if of_frames is None:
-            expected, where = self._of_mesh[name], name
+            expected, label = self._of_mesh[name], name
         else:
             frame %= self.n_frames
-            expected, where = int(of_frames[frame]), f"{name} of frame {frame}"
+            expected, label = int(of_frames[frame]), f"{name} of frame {frame}"
         if checksum.total([checksum.share(values, 0)]) != expected:
-            raise self._broken(where)
+            raise self._damaged(label)
         return values
 
-    def _broken(self, what: str) -> InputError:
-        return InputError(f"{self.path}: is damaged: {what} is not what was written; run the deck again")
+    def _damaged(self, name: str) -> InputError:
+        return InputError(f"{self.path}: is damaged: {name} is not what was written; run the deck again")
 
 
 def _ascending(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Rows of the numbers from 0 on, in their order; -1 is no number."""
+    """Rows of the numbers 0, 1, ..., in this order; -1 is not a number."""
     rows = np.flatnonzero(numbers >= 0)
     return rows[np.argsort(numbers[rows])]
 
 
 def unfinished_bytes(directory: Path) -> int:
-    """Room that the unfinished results in a directory take, which a run there goes on with or writes anew."""
+    """Size of the unfinished results in a directory; a run there continues or replaces them."""
     path = Path(directory) / UNFINISHED
     return path.stat().st_size if path.exists() else 0
 
 
 def is_unfinished(directory: Path) -> bool:
-    """Whether a directory holds results of a run that did not come to its end."""
+    """Whether a directory holds results of a run that did not finish."""
     return (Path(directory) / UNFINISHED).exists()
 
 
 def is_finished(directory: Path) -> bool:
-    """Whether a directory holds the result of a run that came to its end."""
+    """Whether a directory holds the result of a run that finished."""
     return (Path(directory) / FINISHED).exists()
 
 
 def is_result(path: Path) -> bool:
-    """Whether the HDF5 file is a result of ours, of whatever layout; InputError if it is no HDF5 file."""
+    """Whether the HDF5 file is a result of mpitled, of any layout. InputError if it is not HDF5."""
     with open_file(path) as file, damaged(path, "give another file"):
         hdf5_validation.check_file(file, path)
         return "mpitled" in file and "VTKHDF" in file
 
 
 def open_result(path: Path) -> Result:
-    """Results in a file, or in a directory: there the unfinished ones, which are later than any finished, if any.
+    """Results in a file, or in a directory: the unfinished ones, if any, because they are newer than finished ones.
 
-    InputError if there are none, or the file is not one of ours or cut short.
+    InputError if there are no results, or the file is not a result of mpitled or truncated.
     """
     path = Path(path)
     if path.is_dir():
-        there = [path / name for name in (UNFINISHED, FINISHED) if (path / name).exists()]
-        if not there:
+        found = [path / name for name in (UNFINISHED, FINISHED) if (path / name).exists()]
+        if not found:
             raise InputError(f"{path}: holds no result; give the folder that 'mpitled run' wrote")
-        path = there[0]
+        path = found[0]
     file = open_file(path)
     try:
         with damaged(path, AGAIN):

@@ -66,7 +66,7 @@ class InteriorCells(CellForces):
         """Kinds of cells that the rank does not have."""
         sub = scene.sub
         kinds = {block.name for block in sub.packed}
-        if sub.rows.n_own_hexahedra == 0:
+        if sub.rows.n_own("hexahedra") == 0:
             yield f"{VoxelRuns.name}, {HexahedronBatches.name}: no hexahedra"
         elif VoxelRuns.name not in kinds:
             yield f"{VoxelRuns.name}: no {SHORTEST_RUN} equal boxes in a row"

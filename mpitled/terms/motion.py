@@ -157,7 +157,7 @@ class RelaxationUpdate(_Update):
         """The method, and mass tensors."""
         if not present:
             yield f'relaxation, damping, mass tensors: solver.method = "{scene.method.value}"'
-        elif not scene.sub.rows.n_domains:
+        elif not any(block.kind.meshfree for block in scene.sub.rows.blocks):
             yield "mass tensors: no support domains, whose stiffness depends on the direction"
 
     def apply(self, s: State) -> None:
