@@ -54,7 +54,9 @@ def load_deck(
         raise InputError(f"{path}: has a list or section that is nested too deeply; correct the TOML") from None
     used = canonical(deck)
     for way, reason in _conflicts(deck, used):
-        raise source.error(way, reason, _at(used, way)) if way else InputError(f"{path}: {reason}")
+        value = _at(table, way)
+        value = _at(used, way) if value is _ABSENT else value
+        raise source.error(way, reason, value) if way else InputError(f"{path}: {reason}")
     return deck
 
 
