@@ -118,34 +118,6 @@ def parser(commands: Mapping[str, Callable[[argparse.Namespace], int | None]]) -
     )
     study.add_argument("--beyond", type=float, metavar="MM", help="errors farther than this from prescribed edges")
 
-    stability = command(
-        "stability", "scenes taken to extremes: which complete, which stop; goes on where it was stopped"
-    )
-    stability.add_argument(
-        "--out", type=Path, default=Path("out/stability"), metavar="DIR", help="folder of the runs (%(default)s)"
-    )
-    axes: Any = stability.add_argument("--only", default="", metavar="AXIS,...", help="some of the axes, not all")
-    axes.completer = _axes
-
-    bench = command("bench", "speed of the step on fixed scenes, against what the machine can do")
-    bench.add_argument("--json", type=Path, metavar="FILE", help="write the outcome")
-    bench.add_argument("--compare", type=Path, metavar="OLD.json", help="exit status 1 if a case is 10 %% slower")
-    bench.add_argument("--ranks", metavar="N,...", help="numbers of ranks (1,2 where there are two cores)")
-    bench.add_argument("--quick", action="store_true", help="the smallest of each scene, in less time")
-    bench.add_argument("--scaling", action="store_true", help="instead: ranks beside as many runs of one rank at once")
-    bench.add_argument("--omissions", action="store_true", help="instead: what each thing costs that a scene can lack")
-
-    predict = command("predict", "efficiency on a cluster, from real partitions in many parts", json=True)
-    _model(predict)
-    predict.add_argument(
-        "--parts", default="64,256,1024,4096,16384", metavar="N,...", help="numbers of ranks (%(default)s)"
-    )
-    predict.add_argument("--latency", type=float, metavar="US", help="microseconds a message takes (1.5)")
-    predict.add_argument("--bandwidth", type=float, metavar="GB/S", help="of one rank, in each direction (10)")
-    predict.add_argument("--rate", type=float, metavar="M", help="million boxes a second of one core (60)")
-    predict.add_argument("--fixed", type=float, metavar="US", help="microseconds of a step that depend on no size (15)")
-    predict.add_argument("--out", type=Path, metavar="DIR", help="folder of predict.csv and predict.png (the model's)")
-
     export = command(
         "export",
         "write a model as decks that run to the same result here, and elsewhere if volumes change little, or a result "
@@ -198,12 +170,6 @@ def _keys(prefix: str, parsed_args: argparse.Namespace | None = None, **_others:
     if given:
         return [f"{key}={value}" for value in known.get(key, ())]
     return [f"{name}=" for name in known if name.startswith(prefix)]
-
-
-def _axes(prefix: str, **_others: object) -> list[str]:
-    from mpitled.batch.extremes import AXES
-
-    return [name for name in AXES if name.startswith(prefix)]
 
 
 def _model(added: argparse.ArgumentParser) -> None:

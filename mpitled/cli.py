@@ -339,70 +339,6 @@ def _study(options: argparse.Namespace) -> None:
         print(f"{study.table(rows)}\nwritten to {out}")
 
 
-def _bench(options: argparse.Namespace) -> int:
-    from mpitled.speed import bench
-
-    if options.omissions:
-        from mpitled.speed import omissions
-
-        print(omissions.measure(options.quick))
-        return 0
-    ranks = _numbers("--ranks", options.ranks) if options.ranks else bench.default_ranks()
-    bench.check_ranks(ranks)
-    if options.scaling:
-        from mpitled.speed import scaling
-
-        print(scaling.measure(ranks, options.quick))
-        return 0
-    old = bench.load(options.compare) if options.compare else None
-    outcome = bench.bench(ranks, options.quick, old)
-    print(bench.table(outcome))
-    if options.json:
-        bench.write(outcome, options.json)
-    if old is None:
-        return 0
-    text, slower = bench.comparison(outcome, old)
-    print(text)
-    return int(slower)
-
-
-def _predict(options: argparse.Namespace) -> None:
-    from dataclasses import replace
-
-    from mpitled.speed import predict
-
-    counts, path = _numbers("--parts", options.parts), _model(options.model)
-    cluster = predict.Cluster()
-    for name, unit in (("latency", 1e-6), ("bandwidth", 1e9), ("rate", 1e6), ("fixed", 1e-6)):
-        value = getattr(options, name)
-        if value is not None:
-            if not 0 < value < float("inf"):
-                raise InputError(f"--{name} {value:g}: is not a number above 0; give one")
-            cluster = replace(cluster, **{name: value * unit})
-    out = options.out or path.parent
-    rows = predict.predict(path, counts, cluster, out)
-    _print(rows, partial(predict.table, cluster=cluster), options)
-    if not options.json:
-        print(f"written to {out}")
-
-
-def _numbers(name: str, text: str) -> list[int]:
-    """Whole numbers above 0 between commas."""
-    words = text.split(",")
-    if not all(word.strip().isdecimal() and int(word) > 0 for word in words):
-        raise InputError(f"{name} {text}: is not a list of whole numbers above 0; write for example {name} 1,2")
-    return [int(word) for word in words]
-
-
-def _stability(options: argparse.Namespace) -> int:
-    from mpitled.batch import stability
-
-    rows = stability.matrix(options.out, [name for name in options.only.split(",") if name])
-    print(stability.summary(rows))
-    print(f"written to {options.out}")
-    return 1 if any(row["outcome"] == stability.WRONG for row in rows) else 0
-
-
 def _info(options: argparse.Namespace) -> int:
     from mpitled import info
 
@@ -424,9 +360,6 @@ _COMMANDS: dict[str, Callable[[argparse.Namespace], int | None]] = {
     "view": _view,
     "compare": _compare,
     "study": _study,
-    "stability": _stability,
-    "bench": _bench,
-    "predict": _predict,
     "export": _export,
     "info": _info,
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
@@ -12,16 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from mpitled import deck as decks
 from mpitled import job, resources
-from mpitled.cells.voxel_runs import SHORTEST_RUN
 from mpitled.deck import Deck
 from mpitled.errors import everywhere
 from mpitled.parallel.halo import World
-from mpitled.parallel.subdomain import Subdomain
 from mpitled.preview import forecast
-from mpitled.solver.central_difference import March
-from mpitled.speed.witness import Call, distinct_bytes, witness
+from mpitled.preview.kernel_trace import Call, distinct_bytes, trace_kernels
+from mpitled.terms.term import Method
 
 
 def dry_run(deck: Deck, directory: Path, world: World, *, verbose: bool = False) -> str:
@@ -33,10 +30,10 @@ def dry_run(deck: Deck, directory: Path, world: World, *, verbose: bool = False)
     run = job.prepare(deck, directory, world)
     run.warm_up()
     with everywhere():
-        run.method.begin()
-    method, sub = run.method, run.sub
-    terms = [(name, partial(act, method.state)) for name, act in (*method.forces, *method.motion)]
-    calls, surveyed = witness(terms), witness([("survey", method.look)])
+        run.integrator.begin()
+    method, sub = run.integrator, run.sub
+    terms = [(term.name, partial(term.apply, method.state)) for term in method.step.terms]
+    calls, surveyed = trace_kernels(terms), trace_kernels([("check", method.check)])
     seconds, survey = forecast.measure(method)
     step = sum(seconds.values())
     counts = [sub.rows.n_own_hexahedra, sub.rows.n_own_domains, sub.n_nodes, sum(len(nodes) for _, nodes in sub.shared)]
@@ -51,8 +48,7 @@ def dry_run(deck: Deck, directory: Path, world: World, *, verbose: bool = False)
         numbers = [f"{value:{width}.0f}" for value, width in zip(row, (11, 9, 9, 8, 20, 20), strict=False)]
         lines.append(f"{rank:4}{''.join(numbers)}{row[-2]:10.3f}{row[-1]:12.3f}")
     lines += _told(calls, surveyed, seconds, verbose)
-    own = _left_out(deck, sub, world.size, (*calls, *surveyed))
-    left_out = [world.broadcast(own, rank) for rank in range(world.size)]
+    left_out = [world.broadcast(run.left_out, rank) for rank in range(world.size)]
     lines.append("left out:")
     for what in dict.fromkeys(what for of_rank in left_out for what in of_rank):
         ranks = [str(rank) for rank, of_rank in enumerate(left_out) if what in of_rank]
@@ -116,86 +112,6 @@ def _in_full(calls: Sequence[Call]) -> list[str]:
     return lines
 
 
-def left_out(directory: Path, metadata: Mapping[str, Any]) -> list[str]:
-    """What the run in a directory, whose result records this of it, did without on rank 0, as `dry_run` tells it."""
-    deck, ranks = decks.recorded(metadata["deck"], directory), metadata["ranks"]
-    sub, method = forecast.first_rank(deck, directory / job.MODEL, ranks)
-    return _left_out(deck, sub, ranks, witness([("all", method.warm_up)]))
-
-
-def _left_out(deck: Deck, sub: Subdomain, ranks: int, calls: Sequence[Call]) -> list[str]:
-    """The kernels that are not called and the arguments that are not there, each with what spares them."""
-    called = {call.kernel for call in calls}
-    spared: dict[str, list[str]] = {}
-    for kernel, why in reasons(deck, sub, ranks).items():
-        if why and kernel not in called:
-            spared.setdefault(why, []).append(kernel)
-    absent: dict[str, list[str]] = {}
-    for call in calls:
-        for name in call.absent:
-            absent.setdefault(name, []).append(call.kernel)
-    for name, kernels in absent.items():
-        spared.setdefault(_ABSENT[name](deck), []).append(f"{name} of {' and '.join(dict.fromkeys(kernels))}")
-    for what, why in _scene(deck, sub):
-        spared.setdefault(why, []).append(what)
-    return [f"{', '.join(names)}: {why}" for why, names in spared.items()]
-
-
-def reasons(deck: Deck, sub: Subdomain, ranks: int) -> dict[str, str]:
-    """Why each kernel is not called, if it is not; "" where it may yet be, later in the run."""
-    relaxes = deck.solver.method == "dynamic-relaxation"
-    hexahedra = "no hexahedra" if sub.rows.n_own_hexahedra == 0 else ""
-    voxels = hexahedra or f"no {SHORTEST_RUN} equal boxes in a row"
-    general = hexahedra or f"all hexahedra are boxes, {SHORTEST_RUN} or more in a row"
-    domains = "no support domains"
-    alone = "one rank" if ranks == 1 else "" if sub.shared else "no node is shared"
-    method = f'solver.method = "{deck.solver.method}"'
-    heavier = method if deck.solver.method != "quasi-static" else "solver.mass_scaling = false"
-    return {
-        "voxel_forces": voxels,
-        "voxel_survey": voxels,
-        "hexahedron_forces": general,
-        "hexahedron_survey": general,
-        "domain_forces": domains,
-        "domain_survey": domains,
-        "follow": "no node is turned",
-        "react": "no node is moved" if ranks == 1 else "no node of this rank is moved",
-        "update": method,
-        "relax": method,
-        "change_step": method if relaxes else "",
-        "kinetic_energy": method,
-        "raise_mass": heavier,
-        "keep_masses": method,
-        "invert_masses": method,
-        "watch_relaxation": method,
-        "gather": alone,
-        "add": alone,
-        "add_gathered": alone,
-        "scatter": alone,
-        **dict.fromkeys(("scramble", "perturb", "respond"), ""),
-    }
-
-
-#: Why an argument of a kernel is not there.
-_ABSENT: dict[str, Callable[[Deck], str]] = {
-    "position": lambda deck: f"support.stabilisation = {deck.support.stabilisation:g}",
-    "inverse": lambda deck: f"support.stabilisation = {deck.support.stabilisation:g}",
-    "mobility": lambda deck: "relaxation has no inertia where nodes are moved",
-    "copied": lambda deck: f'solver.precision = "{deck.solver.precision}"',
-    "tensor": lambda deck: f'solver.method = "{deck.solver.method}": masses are scalars',
-}
-
-
-def _scene(deck: Deck, sub: Subdomain) -> list[tuple[str, str]]:
-    """What else a scene may do without."""
-    lines = []
-    if deck.tumour is None:
-        lines.append(("tumour", "no [tumour]: no seed, no graded cloud, no volume balance"))
-    if len(sub.rows.materials) == 1:
-        lines.append(("materials", f"{sub.rows.materials[0].name} alone"))
-    return lines
-
-
 def _held_bytes(*roots: object) -> int:
     """Bytes of all arrays that can be reached from some objects, each once."""
     arrays: dict[int, int] = {}
@@ -209,7 +125,7 @@ def _held_bytes(*roots: object) -> int:
             arrays[id(value)] = value.nbytes
         elif id(value) not in seen:
             seen.add(id(value))
-            if is_dataclass(value):
+            if is_dataclass(value) and not hasattr(value, "__dict__"):
                 todo += [getattr(value, field.name) for field in fields(value)]
             elif isinstance(value, list | tuple):
                 todo += value
@@ -222,11 +138,11 @@ def _held_bytes(*roots: object) -> int:
 
 def _forecast(run: Any, step: float, survey: float) -> list[str]:
     """How many steps, and how long they take on the slowest rank by what was measured."""
-    method, state = run.method, run.method.state
-    if isinstance(method, March):
+    method, state = run.integrator, run.integrator.state
+    if method.scene.method is not Method.RELAXATION:
         length = f" of {state.time_step:.4g} s"
         more = "; the step may become shorter where cells need it, and longer again"
-        if run.deck.solver.method == "quasi-static":
+        if method.scene.method is Method.QUASI_STATIC:
             more = "; then a relaxation to rest, to tell the distance to it"
     else:
         length = " of load"

@@ -14,10 +14,12 @@ from mpitled import resources, store
 from mpitled.deck import Deck
 from mpitled.model import Model
 from mpitled.parallel.halo import World
-from mpitled.parallel.subdomain import PRECISIONS, Subdomain, localise
-from mpitled.solver.central_difference import March
-from mpitled.solver.dynamic_relaxation import Relaxation
-from mpitled.solver.run import cell_data
+from mpitled.parallel.subdomain import PRECISIONS, localise
+from mpitled.solver.integrator import Integrator
+from mpitled.solver.integrators import make_integrator
+from mpitled.solver.output import cell_data
+from mpitled.terms import Scene
+from mpitled.terms.term import Method
 
 #: Times that each term is called to tell how long it takes; the fastest counts, for others may use the machine too.
 CALLS = 9
@@ -44,22 +46,21 @@ class Forecast(NamedTuple):
         return f"{steps}, on one rank here; {resources.told(self.output_bytes)} of results"
 
 
-def measure(method: March | Relaxation) -> tuple[dict[str, float], float]:
+def measure(method: Integrator) -> tuple[dict[str, float], float]:
     """Seconds that each term of a step takes on the state that the method has, and those of a survey."""
-    terms = (*method.forces, *method.motion)
-    seconds: dict[str, float] = dict.fromkeys((name for name, _ in terms), math.inf)
+    seconds: dict[str, float] = dict.fromkeys((term.name for term in method.step.terms), math.inf)
     for _ in range(CALLS):
         step = dict.fromkeys(seconds, 0.0)
-        for name, act in terms:  # in their order: the halo's end needs its beginning
-            step[name] += _seconds(partial(act, method.state))
+        for term in method.step.terms:  # in their order: the halo's end needs its beginning
+            step[term.name] += _seconds(partial(term.apply, method.state))
         seconds = {name: min(least, step[name]) for name, least in seconds.items()}
-    return seconds, min(_seconds(method.look) for _ in range(CALLS))
+    return seconds, min(_seconds(method.check) for _ in range(CALLS))
 
 
-def expect(method: March | Relaxation, step: float, survey: float, output_bytes: int) -> Forecast:
+def expect(method: Integrator, step: float, survey: float, output_bytes: int) -> Forecast:
     """What a method that is ready to begin will take, at so many seconds a step and a survey."""
-    at_least = isinstance(method, Relaxation)
-    return Forecast(method.expected_steps, method.expected_surveys, at_least, step, survey, output_bytes)
+    at_least = method.scene.method is Method.RELAXATION
+    return Forecast(method.expected_steps, method.expected_checks, at_least, step, survey, output_bytes)
 
 
 def forecast(deck: Deck, model: Model) -> Forecast:
@@ -67,23 +68,21 @@ def forecast(deck: Deck, model: Model) -> Forecast:
     with tempfile.TemporaryDirectory() as folder:  # ranks read their part from a file, and so does this one
         path = Path(folder) / "model.h5"
         store.write_model(path, model, "")
-        sub, method = first_rank(deck, path)
+        method = first_rank(deck, path)
     method.warm_up()
     method.begin()
     seconds, survey = measure(method)
-    size = store.result_bytes(sub.rows, deck.output.frames + 1, cell_data(deck))
+    size = store.result_bytes(method.sub.rows, deck.output.frames + 1, cell_data(deck))
     return expect(method, sum(seconds.values()), survey, size)
 
 
-def first_rank(deck: Deck, path: Path, ranks: int = 1) -> tuple[Subdomain, March | Relaxation]:
-    """The part of rank 0 of a model that is cut for so many, and its method at rest, which does without the others."""
+def first_rank(deck: Deck, path: Path, ranks: int = 1) -> Integrator:
+    """The integrator of rank 0 at rest, of a model that is cut for so many ranks; it does without the others."""
     rows, figures = store.read_part(path, ranks, 0), store.read_figures(path)
     solver, frames, world = deck.solver, deck.output.frames, World()
     hourglass, rule, precision = deck.hexahedra.hourglass, deck.hexahedra.gradient, PRECISIONS[solver.precision]
     sub = localise(rows, hourglass, deck.support.stabilisation, rule, precision)
-    if solver.method == "dynamic-relaxation":
-        return sub, Relaxation(solver, frames, sub, world, None, None)
-    return sub, March(solver, frames, sub, world, None, None, figures)
+    return make_integrator(Scene(sub, solver, deck=deck), frames, world, figures)
 
 
 def _seconds(act: Callable[[], object]) -> float:
