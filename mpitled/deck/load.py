@@ -282,7 +282,10 @@ def keys(path: Path | None = None) -> dict[str, list[str]]:
         inner = table.get(home.section, {})
         if table and home.section in GEOMETRIES and not inner:
             continue
-        names = range(len(inner)) if isinstance(inner, list) else inner
+        names = list(range(len(inner))) if isinstance(inner, list) else list(inner)
+        if home.law:
+            laws = (home.law, _ABSENT) if home.law == DEFAULT_LAW else (home.law,)
+            names = [name for name in names if _at(inner, (name, "law")) in laws]
         prefixes = [home.section] if home.depth == 2 else [f"{home.section}.{name}" for name in names]
         found |= {f"{prefix}.{name}": _completions(key) for prefix in prefixes for name, key in home.keys.items()}
     return found
