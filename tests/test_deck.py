@@ -87,7 +87,6 @@ def complaint(path, *overrides):
 WRONG = [
     # impossible values
     (BLOCK, "material.brain.poissons_ratio", 0.5, "not less than 0.5; give a number above -1 and below 0.5"),
-    (BLOCK, "material.brain.youngs_modulus", 0.0, "not greater than 0; give a number above 0, in Pa"),
     (BLOCK, "material.brain.youngs_modulus", math.inf, "give a number above 0, in Pa"),
     (BLOCK, "material.brain.youngs_modulus", math.nan, "give a number above 0, in Pa"),
     (BLOCK, "material.brain.youngs_modulus", 1e31, "not a number up to 1e30; give a number above 0, in Pa"),
@@ -101,34 +100,27 @@ WRONG = [
     (BLOCK, "block.fitted", "cyst", "is none of the spheres (there are none); add [sphere.cyst]"),
     (FULL, "tumour.volume", 33.5, "less than the seed's 33.51 mm3; give more, or a smaller tumour.seed_radius"),
     (FULL, "cloud.radius", 2.0, "lies within the seed; give more than tumour.seed_radius = 2 mm"),
-    (FULL, "cloud.seed", -1, "an integer at least 0 (default 0)"),
     (FULL, "block.cloud", "none", 'give "core" or "all"'),
     (FULL, "solver.time_step", 0.0, 'give "auto" or a number above 0, in s (default "auto")'),
-    (FULL, "solver.time_step", "slow", 'give "auto" or a number above 0, in s (default "auto")'),
     (FULL, "solver.time_step", 2.5, "is longer than solver.load_time; give less than 2 s"),
     (FULL, "displaced.0.displacement", [6.0], "one number for each of"),
     (FULL, "displaced.0.displacement", [], "wrong number of entries; give a list of numbers, in mm"),
     (FULL, "displaced.0.rotation", 361, "a number at least -360 and at most 360, in degrees (default 0.0)"),
-    (HEAD, "labels.image", "foot.nii.gz", "there is no file"),
     (HEAD, "labels.image", "", "give a path relative to the deck's folder"),
     (HEAD, "labels.left_ventricle", [1], "1 is in labels.tissue already; name a label once"),
     # wrong types: nothing is converted
     (BLOCK, "block.size", 30.0, "is not a list; give a list of 3 numbers above 0, in mm"),
-    (BLOCK, "block.size", [30.0, 24.0], "wrong number of entries; give a list of 3 numbers"),
     (BLOCK, "block.size", [30.0, "24", 24.0], "entry 2 is not a valid number"),
     (BLOCK, "block.elements", [10, 8.0, 8], "entry 2 is not a valid integer; give a list of 3 integers"),
-    (BLOCK, "block.elements", [10, True, 8], "entry 2 is not a valid integer"),
     (BLOCK, "material.brain.youngs_modulus", "3000", "is not a valid number; give a number"),
     (BLOCK, "material.brain.youngs_modulus", {"value": 3000.0}, "is not a valid number; give a number"),
     (BLOCK, "material.brain.youngs_modulus", True, "is not a valid number; give a number"),
-    (BLOCK, "material.brain.cells", "tissue", 'is not a list; give a list of strings (default ["all"])'),
     (BLOCK, "material.brain.cells", [], "wrong number of entries"),
     (BLOCK, "material.brain.cells", ["all", "all"], "has an entry twice"),
     (BLOCK, "material.brain.law", "neo-hooke", "is not offered; did you mean neo-hookean?"),
     (BLOCK, "material.brain.law", {}, "is not offered"),
     (BLOCK, "support.consistency", 1, "give true or false (default true)"),
     (BLOCK, "support.weight", "quartik", 'did you mean quartic?; give "equal" or "quartic" (default "quartic")'),
-    (BLOCK, "support.basis", 7, "is not offered; give 4 or 10 or 20 (default 4)"),
     (BLOCK, "title", 3, "give a string"),
     (FULL, "fixed.0.directions", ["x", "w"], "entry 2 is not offered"),
     # sections that are none, and keys out of place
@@ -144,7 +136,6 @@ WRONG = [
     (FULL, "fixed.0.node", "x1", "unknown key; did you mean nodes?"),
     (BLOCK, "block.density", 1000.0, "unknown key; density belongs to [material.NAME]"),
     (BLOCK, "poissons_ratio", 0.49, 'poissons_ratio belongs to [material.NAME] law = "neo-hookean"'),
-    (BLOCK, "output.zzz", 1, "unknown key; there are frames"),
 ]
 
 
@@ -504,7 +495,7 @@ def message(parameters):
 deck = message("modulus = 30\\nexponent = 2.5")
 assert deck.materials[1].material.law == Stiffening(modulus=30.0, exponent=2.5)
 assert canonical(deck)["material"]["x"]["exponent"] == 2.5
-assert "material.x.exponent" in keys(path)
+assert "material.x.exponent" in keys(path) and "material.brain.exponent" not in keys(path)
 for parameters, words in (
     ("modulus = -1.0\\nexponent = 2.0", "modulus = -1.0: is not greater than 0; give a number above 0, in Pa"),
     ("modulus = 1e31\\nexponent = 2.0", "modulus = 1e+31: is not a number up to 1e30; give a number above 0, in Pa"),

@@ -110,7 +110,7 @@ def test_what_is_wrong_with_a_field_is_said_in_a_line(tmp_path, change, message)
 def test_either_displacement_or_field(tmp_path):
     (tmp_path / "scene.toml").write_text(SCENE)
     (tmp_path / "field.csv").touch()
-    with pytest.raises(InputError, match=r"displaced.0.field: is there beside displacement"):
+    with pytest.raises(InputError, match=r"displaced.0.field = .*: cannot be combined with displacement"):
         deck.load_deck(tmp_path / "scene.toml", ["displaced.0.displacement=[0,0,1]"])
     with pytest.raises(InputError, match=r"displaced.0.displacement: is missing; .* or displaced.field"):
         deck.load_deck(tmp_path / "scene.toml", ['displaced=[{nodes="surface"}]'])

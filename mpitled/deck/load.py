@@ -54,7 +54,9 @@ def load_deck(
         raise InputError(f"{path}: has a list or section that is nested too deeply; correct the TOML") from None
     used = canonical(deck)
     for way, reason in _conflicts(deck, used):
-        raise source.error(way, reason, _at(used, way)) if way else InputError(f"{path}: {reason}")
+        value = _at(table, way)
+        value = _at(used, way) if value is _ABSENT else value
+        raise source.error(way, reason, value) if way else InputError(f"{path}: {reason}")
     return deck
 
 
@@ -280,7 +282,10 @@ def keys(path: Path | None = None) -> dict[str, list[str]]:
         inner = table.get(home.section, {})
         if table and home.section in GEOMETRIES and not inner:
             continue
-        names = range(len(inner)) if isinstance(inner, list) else inner
+        names = list(range(len(inner))) if isinstance(inner, list) else list(inner)
+        if home.law:
+            laws = (home.law, _ABSENT) if home.law == DEFAULT_LAW else (home.law,)
+            names = [name for name in names if _at(inner, (name, "law")) in laws]
         prefixes = [home.section] if home.depth == 2 else [f"{home.section}.{name}" for name in names]
         found |= {f"{prefix}.{name}": _completions(key) for prefix in prefixes for name, key in home.keys.items()}
     return found
