@@ -3,43 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, ClassVar, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mpitled import kernels
-from mpitled.parallel.subdomain import SHORTEST_RUN, DomainBatches, HexahedronBatches, Subdomain, VoxelRuns
+from mpitled.parallel.subdomain import SHORTEST_RUN, Subdomain
 from mpitled.terms.state import State
 from mpitled.terms.term import Scene, Side, StabilityBound, Term, energy
-
-#: Adds the forces (N) of cells at displacements u to f; returns the smallest J among them.
-Forces = Callable[[NDArray[np.floating], NDArray[np.floating]], float]
-
-
-class PackedCells(Protocol):
-    """A block of cells of one kind, packed as its kernels take them; those with shared nodes come first."""
-
-    @property
-    def name(self) -> str:
-        """Name of the kind."""
-
-    @property
-    def n_border(self) -> int:
-        """Number of leading batches or runs with nodes that other ranks have too."""
-
-    def forces(self, part: slice) -> Forces:
-        """The function that adds the forces of some of the batches or runs."""
-
-    def check(
-        self,
-        u: NDArray[np.floating],
-        required: NDArray[np.float64],
-        factor: float,
-        jacobian: NDArray[np.float32],
-        tensor: NDArray[np.float64] | None,
-    ) -> dict[str, float]:
-        """Energies (J) by the names of `CellForces.figures`; fills or adds to the arrays of a `StabilityBound`."""
 
 
 class CellForces(Term):
@@ -56,7 +28,6 @@ class CellForces(Term):
         self._block, self._forces = block, block.forces(part)
 
     def apply(self, s: State) -> None:
-        """Add the forces."""
         jacobian = self._forces(s.u_cells, s.f)
         if jacobian < s.smallest_jacobian:
             s.smallest_jacobian = jacobian
@@ -70,16 +41,14 @@ class BorderCells(CellForces):
 
     @classmethod
     def from_scene(cls, scene: Scene) -> Iterator[Term]:
-        """One term for each block with cells at the border, on several ranks."""
         if scene.halo is not None:
-            for block in packed_blocks(scene.sub):
+            for block in packed_cells(scene.sub):
                 if block.n_border:
                     yield cls(block, slice(block.n_border))
 
     @classmethod
     def left_out(cls, scene: Scene, present: bool) -> Iterable[str]:
-        """Nothing: see `InteriorCells`."""
-        return ()
+        return ()  # see `InteriorCells`
 
 
 class InteriorCells(CellForces):
@@ -87,99 +56,83 @@ class InteriorCells(CellForces):
 
     @classmethod
     def from_scene(cls, scene: Scene) -> Iterator[Term]:
-        """One term for each block."""
-        for block in packed_blocks(scene.sub):
+        for block in packed_cells(scene.sub):
             yield cls(block, slice(None) if scene.halo is None else slice(block.n_border, None))
 
     @classmethod
     def left_out(cls, scene: Scene, present: bool) -> Iterator[str]:
-        """Kinds of cells that the rank does not have."""
         sub = scene.sub
         if sub.rows.n_own_hexahedra == 0:
-            yield f"{_Voxels.name}, {_Hexahedra.name}: no hexahedra"
+            yield f"{VOXELS}, {HEXAHEDRA}: no hexahedra"
         elif sub.runs is None:
-            yield f"{_Voxels.name}: no {SHORTEST_RUN} equal boxes in a row"
+            yield f"{VOXELS}: no {SHORTEST_RUN} equal boxes in a row"
         elif sub.hexahedra is None:
-            yield f"{_Hexahedra.name}: all are boxes, {SHORTEST_RUN} or more in a row"
+            yield f"{HEXAHEDRA}: all are boxes, {SHORTEST_RUN} or more in a row"
         if sub.domains is None:
-            yield f"{_Domains.name}: no cloud"
+            yield f"{DOMAINS}: no cloud"
         elif sub.domains.position is None:
             yield "stabilisation of support domains: support.stabilisation = 0"
 
     def check(self, s: State, bound: StabilityBound) -> Mapping[str, float]:
-        """Energies, J and bounds of all cells of the block."""
         return self._block.check(s.u_cells, bound.required, bound.factor, bound.jacobian, bound.tensor)
 
 
-# --- the blocks of a subdomain ----------------------------------------------------------------------------------------
+# --- packed cells of a subdomain --------------------------------------------------------------------------------------
 
 
-def packed_blocks(sub: Subdomain) -> list[PackedCells]:
+class PackedCells(NamedTuple):
+    """A block of cells of one kind, packed as its kernels take them; those with shared nodes come first."""
+
+    name: str  # of the kind
+    arrays: Any
+    n_border: int  # batches or runs, the first, with nodes that other ranks have too
+    kernel: str  # adds forces and returns the smallest J
+    check_kernel: str  # returns energies
+    energies: tuple[str, ...]  # their lines in the ledger
+
+    def forces(self, part: slice) -> Callable[[NDArray[np.floating], NDArray[np.floating]], float]:
+        """The function of u and f that adds the forces of some of the batches or runs; returns the smallest J."""
+        first, name = self.name != VOXELS, self.kernel
+        some = [
+            a if a is None else a[part] if first else np.ascontiguousarray(a[..., part]) for a in self._arguments(name)
+        ]
+        return lambda u, f: float(getattr(kernels, name)(u, f, *some))
+
+    def check(
+        self,
+        u: NDArray[np.floating],
+        required: NDArray[np.float64],
+        factor: float,
+        jacobian: NDArray[np.float32],
+        tensor: NDArray[np.float64] | None,
+    ) -> dict[str, float]:
+        """Energies (J) by the names of `CellForces.figures`; adds to the arrays of a `StabilityBound`."""
+        more = (tensor,) if self.name == DOMAINS else ()
+        arguments = (*self._arguments(self.check_kernel), required, factor, jacobian, *more)
+        return dict(zip(self.energies, getattr(kernels, self.check_kernel)(u, *arguments), strict=True))
+
+    def _arguments(self, kernel: str) -> list[NDArray[Any] | None]:
+        return [getattr(self.arrays, name) for name in _ARGUMENTS[kernel].split()]
+
+
+VOXELS, HEXAHEDRA, DOMAINS = "voxel hexahedra", "hexahedra", "support domains"
+#: Packed arrays that each kernel takes, in order.
+_ARGUMENTS = {
+    "voxel_forces": "line length along scale coefficient",
+    "voxel_survey": "line length along first_cell scale coefficient gram",
+    "hexahedron_forces": "nodes in_row geometry coefficient",
+    "hexahedron_survey": "nodes cells geometry coefficient gram stiffness",
+    "domain_forces": "nodes gradient position inverse coefficient",
+    "domain_survey": "nodes cells gradient position inverse coefficient gram stiffness",
+}
+
+
+def packed_cells(sub: Subdomain) -> Iterator[PackedCells]:
     """The blocks of cells that a rank has."""
-    blocks: list[PackedCells] = []
-    if sub.runs is not None:
-        blocks.append(_Voxels(sub.runs))
-    if sub.hexahedra is not None:
-        blocks.append(_Hexahedra(sub.hexahedra))
-    if sub.domains is not None:
-        blocks.append(_Domains(sub.domains))
-    return blocks
-
-
-class _Block:
-    """Adapts packed arrays to `PackedCells`."""
-
-    def __init__(self, arrays: Any) -> None:
-        self._arrays, self.n_border = arrays, int(arrays.border)
-
-
-class _Voxels(_Block):
-    name: ClassVar[str] = "voxel hexahedra"
-    _arrays: VoxelRuns
-
-    def forces(self, part: slice) -> Forces:
-        a = self._arrays
-        some = [np.ascontiguousarray(x[..., part]) for x in (a.line, a.length, a.along, a.scale, a.coefficient)]
-        return lambda u, f: kernels.voxel_forces(u, f, *some)
-
-    def check(self, u, required, factor, jacobian, tensor):  # type: ignore[no-untyped-def]
-        a = self._arrays
-        strain, hourglass = kernels.voxel_survey(
-            u, a.line, a.length, a.along, a.first_cell, a.scale, a.coefficient, a.gram, required, factor, jacobian
-        )
-        return {"strain": strain, "hourglass": hourglass}
-
-
-class _Hexahedra(_Block):
-    name: ClassVar[str] = "hexahedra"
-    _arrays: HexahedronBatches
-
-    def forces(self, part: slice) -> Forces:
-        a = self._arrays
-        some = [x[part] for x in (a.nodes, a.in_row, a.geometry, a.coefficient)]
-        return lambda u, f: kernels.hexahedron_forces(u, f, *some)
-
-    def check(self, u, required, factor, jacobian, tensor):  # type: ignore[no-untyped-def]
-        a = self._arrays
-        strain, hourglass = kernels.hexahedron_survey(
-            u, a.nodes, a.cells, a.geometry, a.coefficient, a.gram, a.stiffness, required, factor, jacobian
-        )
-        return {"strain": strain, "hourglass": hourglass}
-
-
-class _Domains(_Block):
-    name: ClassVar[str] = "support domains"
-    _arrays: DomainBatches
-
-    def forces(self, part: slice) -> Forces:
-        a = self._arrays
-        some = [None if x is None else x[part] for x in (a.nodes, a.gradient, a.position, a.inverse, a.coefficient)]
-        return lambda u, f: kernels.domain_forces(u, f, *some)
-
-    def check(self, u, required, factor, jacobian, tensor):  # type: ignore[no-untyped-def]
-        a = self._arrays
-        strain, stabilisation = kernels.domain_survey(
-            u, a.nodes, a.cells, a.gradient, a.position, a.inverse, a.coefficient, a.gram, a.stiffness, required,
-            factor, jacobian, tensor,
-        )  # fmt: skip
-        return {"strain": strain, "stabilisation": stabilisation}
+    for name, arrays, kernel, line in (
+        (VOXELS, sub.runs, "voxel", "hourglass"),
+        (HEXAHEDRA, sub.hexahedra, "hexahedron", "hourglass"),
+        (DOMAINS, sub.domains, "domain", "stabilisation"),
+    ):
+        if arrays is not None:
+            yield PackedCells(name, arrays, arrays.border, f"{kernel}_forces", f"{kernel}_survey", ("strain", line))

@@ -25,6 +25,13 @@ class Method(str, Enum):
     RELAXATION = "dynamic-relaxation"
 
 
+class OnInversion(str, Enum):
+    """What an unstable run does: `solver.on_inversion` of the deck."""
+
+    STOP = "stop"
+    RECOVER = "recover"
+
+
 class Stage(IntEnum):
     """When a term acts in a step. Terms of one stage act in the order of the registry."""
 
@@ -74,6 +81,11 @@ class Scene:
     def method(self) -> Method:
         """How the nodes move."""
         return Method(self.solver.method)
+
+    @property
+    def recovers(self) -> bool:
+        """Whether an unstable run rolls back."""
+        return OnInversion(self.solver.on_inversion) is OnInversion.RECOVER
 
 
 @dataclass(slots=True)
