@@ -109,7 +109,7 @@ class Term:
     must be present on all ranks or on none: decide by `Scene.anywhere`.
     """
 
-    name: str = ""  # for timers and dry runs; terms of one name are timed together
+    name: str = ""  # for timers and dry runs; terms of one name are timed together, and have no restart fields
     stage: ClassVar[Stage] = Stage.FORCES
     figures: ClassVar[tuple[Figure, ...]] = ()
     absent: ClassVar[str] = ""  # why a scene does without it
