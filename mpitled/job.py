@@ -1,4 +1,4 @@
-"""From a deck to a result: model and partition by one rank, then the run on all."""
+"""From a deck to a result: rank 0 builds and partitions the model, then all ranks run it."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from mpitled.solver.progress import Interrupts, Phases
 from mpitled.solver.run import Run
 
 MODEL = "model.h5"
-#: Said of a run that is at its end.
+#: State of a run whose result is complete.
 DONE = "done"
 
 
 def build(deck: Deck, directory: Path, quiet: bool = True) -> tuple[Path, bool]:
-    """The model of a deck in directory/model.h5, and whether it had to be built: the same deck uses it again."""
+    """The model of a deck in directory/model.h5, which the same deck reuses; whether it had to be built."""
     path = directory / MODEL
     key = decks.model_key(deck, included(deck))
     if store.model_key(path) == key:
@@ -36,7 +36,7 @@ def build(deck: Deck, directory: Path, quiet: bool = True) -> tuple[Path, bool]:
         except InputError as error:
             print(f"note: {error}; it is built anew", file=sys.stderr, flush=True)
     atomic.make_folder(directory)
-    from mpitled.model import build as model_build  # only the rank that builds needs the meshers
+    from mpitled.model import build as model_build  # only the rank that builds needs the mesh generators
 
     if not quiet:
         print("note: building the model", file=sys.stderr, flush=True)
@@ -45,7 +45,7 @@ def build(deck: Deck, directory: Path, quiet: bool = True) -> tuple[Path, bool]:
 
 
 def included(deck: Deck) -> list[Path]:
-    """Files that those of the deck read in turn."""
+    """Files that the files of the deck include."""
     if not deck.mesh:
         return []
     from mpitled.readers import meshes
@@ -54,7 +54,7 @@ def included(deck: Deck) -> list[Path]:
 
 
 def divide(path: Path, n_parts: int, seed: int) -> str:
-    """Partition a model in n_parts, stored in its file under that number; a table of the parts."""
+    """Partition a model into n_parts, stored in its file under that number; a table of the parts."""
     cells = store.read_blocks(path)
     costs = cell_costs(store.read_points(path), cells)
     blocks = [partition.Block(block.nodes, block.kind.faces, block.columns.get("points")) for block in cells]
@@ -71,10 +71,10 @@ def divide(path: Path, n_parts: int, seed: int) -> str:
 def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False, resume: bool = False) -> dict[str, Any]:
     """Compute a deck on all ranks; writes model.h5, result.vtkhdf, report.json and pictures into the directory.
 
-    With `resume` it goes on from the last checkpoint there, on any number of ranks, or makes what is missing of a
-    result that is there; from the start where there is neither. Without, a checkpoint of this very run is not written
-    over but refused, and so is that of another, for it may hold days of work, and a folder in which a run is at
-    work.
+    With `resume` the run continues from the last checkpoint in the directory, on any number of ranks. If the result is
+    complete, only its report is made; if there is neither, the run starts from the beginning. Without `resume` the run
+    refuses to overwrite a checkpoint, of this run or another, because it may hold days of work. It also refuses a
+    directory in which another run is active.
 
     The report, on every rank. InputError, UnstableError or InterruptedRun alike on all ranks.
     """
@@ -83,8 +83,8 @@ def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False, resum
         found = world.on_leader(lambda: _resumable(deck, directory) if resume else _refuse_to_lose(deck, directory))
         if found == DONE:
             if world.leads and not quiet:
-                said = "is complete already, and only its report is made; without --resume it is computed anew"
-                print(f"note: {directory}: {said}", file=sys.stderr, flush=True)
+                text = "is complete already, and only its report is made; without --resume it is computed anew"
+                print(f"note: {directory}: {text}", file=sys.stderr, flush=True)
             return _report(directory, world)
         run = prepare(deck, directory, world, quiet=quiet, found=found)
         try:
@@ -92,7 +92,7 @@ def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False, resum
         except MpitledError as error:
             if error.everywhere:
                 run.free()
-                if isinstance(error, UnstableError):  # whoever goes on from where it was arrives here again
+                if isinstance(error, UnstableError):  # a resumed run would fail again
                     world.on_leader(lambda: store.discard_checkpoints(directory))
             raise
         run.free()
@@ -101,12 +101,12 @@ def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False, resum
 
 
 def _report(directory: Path, world: World, seconds: Mapping[str, float] | None = None) -> dict[str, Any]:
-    """Of a run that is at its end, whose checkpoints nobody needs any more."""
+    """The report of a complete run; removes its checkpoints."""
     from mpitled.results import page, report
 
     def write() -> dict[str, Any]:
         store.discard_checkpoints(directory)
-        if seconds is not None:  # of a result that took the place of another
+        if seconds is not None:  # the result replaced another one
             with atomic.writing(directory / page.PAGE):
                 (directory / page.PAGE).unlink(missing_ok=True)
         return report.write(directory, seconds)
@@ -115,7 +115,7 @@ def _report(directory: Path, world: World, seconds: Mapping[str, float] | None =
 
 
 def _resumable(deck: Deck, directory: Path) -> checkpoint.Found | str | None:
-    """Where a run goes on, DONE if nothing but the report may be missing, None if it is to begin; says so."""
+    """The checkpoint to resume; DONE if only the report may be missing; None for a new run. Prints notes."""
     key = decks.model_key(deck, included(deck))
     if checkpoint.is_done(directory, deck, key):
         return DONE
@@ -128,7 +128,7 @@ def _resumable(deck: Deck, directory: Path) -> checkpoint.Found | str | None:
 
 
 def _refuse_to_lose(deck: Deck, directory: Path) -> None:
-    """InputError if a run that could go on is there, this one or another."""
+    """InputError if the directory has a checkpoint, of this run or another."""
     found = checkpoint.newest(directory)
     if found is None:
         return
@@ -146,7 +146,7 @@ def _refuse_to_lose(deck: Deck, directory: Path) -> None:
 def prepare(
     deck: Deck, directory: Path, world: World, *, quiet: bool = False, found: checkpoint.Found | None = None
 ) -> Run:
-    """All that is done before the first step of `run`: model, partition, this rank's part, and the composed step."""
+    """Everything before the first step of `run`: model, partition, the part of this rank, and the composed step."""
     phases = Phases()
     with phases("model"):
         path = world.on_leader(lambda: build(deck, directory, quiet)[0])
@@ -170,13 +170,13 @@ def prepare(
             rows, deck.hexahedra.hourglass, deck.support.stabilisation, rule, PRECISIONS[deck.solver.precision]
         )
         figures = store.read_figures(path)
-    with everywhere():  # each rank finds the same
+    with everywhere():
         about = checkpoint.marks(deck, store.model_key(path) or "") | {"ranks": world.size, "partition": mark}
         return Run(deck, directory, world, sub, figures, phases, quiet, about, found)
 
 
 def ensure_partition(path: Path, n_parts: int, seed: int, quiet: bool = True) -> None:
-    """Partition a model unless it is partitioned in as many parts."""
+    """Partition a model unless it has a partition into so many parts."""
     if not store.has_partition(path, n_parts):
         divide(path, n_parts, seed)
         if not quiet:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from mpitled.deck import load_deck
 from mpitled.errors import InterruptedRun
 from mpitled.parallel.halo import World
 from mpitled.solver.run import Run
-from mpitled.terms.restart import nodal, reduced
+from mpitled.terms.restart import Packed, Scope, nodal, owned_dofs, reduced, replicated, restore, snapshot
 from mpitled.terms.term import Scene, Side, StabilityBound, State, Term, energy
 
 STIFFNESS = 2.0  # N/m, of the spring at each node
@@ -70,6 +71,80 @@ class Spring(Term):
         self.path += float(np.abs(u - self.u_last[:, nodes]).sum())
         self.u_last[:] = s.u[:, : self.u_last.shape[1]]
         return {"spring": 0.5 * STIFFNESS * float((u**2).sum())}
+
+
+@dataclass
+class Fields:
+    """One restart field of each kind."""
+
+    u: NDArray[np.float64] = nodal(single_precision=True)
+    mass: NDArray[np.float64] = nodal()
+    absent: NDArray[np.float64] | None = nodal()
+    reaction: NDArray[np.float64] = owned_dofs()
+    work: float = reduced("sum")
+    smallest: float = reduced("min")
+    time: float = replicated()
+    safety: float = replicated(control=True)
+
+
+def part(nodes, owned, n_parts, number):
+    """As much of a subdomain as restart fields need; dof 3 node + 1 of the global nodes 0 and 3 moves."""
+    moving = np.array([3 * k + 1 for k, node in enumerate(nodes) if node in (0, 3)], np.uint32)
+    rows = SimpleNamespace(owned=np.array(owned), n_parts=n_parts, part=number)
+    return SimpleNamespace(n_nodes=len(nodes), moving=moving, rows=rows)
+
+
+def test_any_number_of_ranks_reads_a_checkpoint():
+    """Nodes 0, 1, 2 and 2, 3 on two ranks, and all on one: sums are kept, and the smallest is the smallest of all."""
+    two = [([0, 1, 2], part([0, 1, 2], [True] * 3, 2, 0)), ([2, 3], part([2, 3], [False, True], 2, 1))]
+    one = [([0, 1, 2, 3], part([0, 1, 2, 3], [True] * 4, 1, 0))]
+    mass = np.array([2.0, 3.0, 5.0, 7.0])
+    u = np.arange(12.0).reshape(3, 4)
+
+    def fields(nodes, sub, work, smallest):
+        moving = [n for n, owned in zip(nodes, sub.rows.owned, strict=True) if owned and n in (0, 3)]
+        reaction = np.array([10.0 + n for n in moving])
+        return Fields(u[:, nodes], mass[nodes], None, reaction, work, smallest, 0.5, 0.8)
+
+    numbers = {1: [(3.0, 0.25)], 2: [(1.0, 0.5), (2.0, 0.25)]}
+    for writers, readers in ((two, one), (one, two), (two, two)):
+        wrote, table = [], numbers[len(writers)]
+        for (nodes, sub), (work, smallest) in zip(writers, table, strict=True):
+            things = {"things": fields(nodes, sub, work, smallest)}
+            packed = Packed()
+            packed.add("now", things, Scope.CHECKPOINT, snapshot(things, Scope.CHECKPOINT), sub)
+            wrote.append(packed)
+        rows = {key: np.concatenate([p.nodal[key] for p in wrote]) for key in wrote[0].nodal}
+        reduced_numbers = {key: np.array([p.reduced[key] for p in wrote]) for key in wrote[0].reduced}
+        read = []
+        for nodes, sub in readers:
+            blank = {
+                "things": Fields(*(np.zeros_like(a[..., nodes]) for a in (u, mass)), None, np.zeros(0), 0, 1, 0, 0)
+            }
+            of_rank = Packed({k: v[nodes] for k, v in rows.items()}, reduced_numbers, wrote[0].replicated)
+            blank["things"].reaction = fields(nodes, sub, 0, 0).reaction * 0
+            restore(blank, Scope.CHECKPOINT, of_rank.snapshot("now", blank, Scope.CHECKPOINT, sub))
+            expected = fields(nodes, sub, 0, 0)
+            for name in ("u", "mass", "reaction", "absent", "time", "safety"):
+                assert np.array_equal(getattr(blank["things"], name), getattr(expected, name)), name
+            read.append(blank["things"])
+        assert sum(f.work for f in read) == 3.0
+        assert min(f.smallest for f in read) == 0.25
+        if len(readers) == len(writers):
+            assert [(f.work, f.smallest) for f in read] == table
+
+
+def test_a_rollback_leaves_controls_and_takes_as_much_as_its_scope():
+    full = Fields(np.ones((3, 2)), np.ones(2), None, np.ones(1), 1.0, 1.0, 1.0, 1.0)
+    for scope, restored in {
+        Scope.ROLLBACK: {"u", "mass", "reaction", "work", "smallest", "time"},
+        Scope.ROLLBACK_TO_REST: {"u", "work", "smallest", "time"},
+        Scope.NUMBERS: {"work", "smallest", "time"},
+    }.items():
+        now = Fields(np.zeros((3, 2)), np.zeros(2), None, np.zeros(1), 0.0, 0.0, 0.0, 0.0)
+        restore({"x": now}, scope, snapshot({"x": full}, scope))
+        changed = {name for name in vars(now) if getattr(now, name) is not None and np.any(getattr(now, name))}
+        assert changed == restored
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Ranks and what they exchange: the only importer of mpi4py, and that only where there is more than one rank."""
+"""Ranks and the exchange between them. The only module that imports mpi4py, and only with more than one rank."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from mpitled import kernels
 from mpitled.errors import MpitledError, everywhere
 
-#: What launchers tell each process of the number of ranks (OpenMPI, MPICH and Intel MPI, PMIx under SLURM).
+#: Environment variables with the number of ranks (OpenMPI, MPICH and Intel MPI, PMIx under SLURM).
 _SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS" if "PMIX_RANK" in os.environ else "PMI_SIZE")
 
 
 def library_version() -> str:
-    """Name and version of the MPI library, which is not started. ImportError or RuntimeError if there is none."""
+    """Name and version of the MPI library, without starting it. ImportError or RuntimeError if there is none."""
     import mpi4py
 
     mpi4py.rc.initialize = False
@@ -29,10 +29,10 @@ def library_version() -> str:
 
 
 class World:
-    """All ranks of the job, or a group of them. Every method is collective: reached by every rank or by none."""
+    """All ranks of the job, or a group of them. Every method is collective: all ranks call it, or none."""
 
     def __init__(self, comm: Any = None) -> None:
-        """comm: of a group, see `split`; without it all ranks that were started."""
+        """comm: communicator of a group, see `split`; by default all ranks that were started."""
         sizes = [int(os.environ[name]) for name in _SIZES if name in os.environ]
         if comm is None and max(sizes, default=1) > 1:
             from mpi4py import MPI
@@ -41,11 +41,11 @@ class World:
         self.rank: int = 0 if comm is None else comm.rank
         self.size: int = 1 if comm is None else comm.size
         self.comm: Any = comm if self.size > 1 else None
-        self.started = bool(sizes)  # by a launcher, be it on one rank
+        self.started = bool(sizes)  # by a launcher, possibly on one rank
         self._host: Any = None
 
     def split(self, size: int) -> World:
-        """This rank's group, where so many ranks in turn make one."""
+        """The group of this rank, if ranks are grouped in order by so many."""
         return World(self.comm.Split(self.rank // size, self.rank))
 
     def host(self) -> Any:
@@ -61,7 +61,7 @@ class World:
         return self.rank == 0
 
     def gather(self, values: Sequence[float]) -> NDArray[np.float64]:
-        """(size, n): every rank's n values, on every rank, so that all take the same decision from the same bits."""
+        """(size, n): the n values of every rank, on every rank, so that all take the same decisions."""
         mine = np.asarray(values, np.float64)
         if self.comm is None:
             return mine[None]
@@ -70,11 +70,11 @@ class World:
         return table
 
     def broadcast(self, value: Any, root: int = 0) -> Any:
-        """A small object of one rank, on all."""
+        """A small object of the root rank, on all ranks."""
         return value if self.comm is None else self.comm.bcast(value, root)
 
     def on_leader(self, work: Callable[[], Any]) -> Any:
-        """The result of work, done by rank 0, on all ranks; its error likewise, before anything collective follows."""
+        """Do work on rank 0; its result, or its MpitledError, on all ranks."""
         outcome: Any = None
         if self.leads:
             try:
@@ -92,7 +92,7 @@ class World:
             self.comm.Barrier()
 
     def abort(self, status: int) -> NoReturn:
-        """End every rank at once: an exception on one alone would leave the others waiting for ever."""
+        """End every rank at once: an exception on one rank alone would leave the others waiting forever."""
         sys.stdout.flush()
         sys.stderr.flush()
         if self.comm is not None:
@@ -101,13 +101,13 @@ class World:
 
 
 class Halo:
-    """Sums of nodal values over the ranks that share a node, the same bits on each of them.
+    """Sums nodal values over the ranks that share a node, with the same bits on each of these ranks.
 
-    Contributions are added in ascending order of rank, the own one in its turn (addition does not associate).
-    Requests are persistent and the buffers are made once: nothing is allocated in an exchange. Ranks of one host read
-    each other's buffers where they are, in memory that they share; their messages are empty and say that a buffer is
-    filled, so that nothing has to be moved while both compute. There are two buffers of each, used in turn: none is
-    written over while the other reads it, for a rank cannot be farther ahead than a message that follows the reading.
+    Contributions are added in ascending order of rank, because addition is not associative. Requests are persistent and
+    buffers are made once: an exchange allocates nothing. Ranks of one host read each other's buffers in shared memory;
+    their messages are empty and only signal that a buffer is filled, so that no data moves while both compute. Each
+    buffer exists twice, and the two are used in turn. No buffer is overwritten while another rank reads it, because a
+    rank cannot be ahead by more than the message that follows the reading.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class Halo:
         components: int,
         precision: type[np.floating] = np.float64,
     ) -> None:
-        """shared: (rank, ascending nodes shared with it), ranks ascending, alike on both sides. Collective."""
+        """shared: (rank, ascending nodes shared with it), ranks ascending, the same on both sides. Collective."""
         self.seconds = {"pack": 0.0, "wait": 0.0, "unpack": 0.0}
         self._all = np.unique(np.concatenate([nodes for _, nodes in shared])) if shared else np.zeros(0, np.uint32)
         self._total = np.empty((components, len(self._all)), precision)
@@ -137,7 +137,7 @@ class Halo:
                 message, answer = (_NOTHING, _NOTHING) if rank in close else (out, back)
                 requests += [world.comm.Recv_init(answer, rank), world.comm.Send_init(message, rank)]
             self._turns.append((sends, below, above, requests))
-        # Other processors than x86 may show another rank's writes in another order than they were made.
+        # Processors other than x86 may show the writes of another rank in a different order.
         self._fence: Callable[[], None] = self._window.Sync if close else lambda: None
         self._start: Callable[[list[Any]], None] = lambda requests: None
         self._wait: Callable[[list[Any]], Any] = lambda requests: None
@@ -147,7 +147,7 @@ class Halo:
             self._start, self._wait = MPI.Prequest.Startall, MPI.Request.Waitall
 
     def start(self, values: NDArray[np.floating]) -> None:
-        """Send what this rank has at shared nodes of values (components, n_nodes), which stays there until `finish`."""
+        """Send the values (components, n_nodes) of this rank at shared nodes; they must not change until `finish`."""
         begin = time.perf_counter()
         sends, *_, requests = self._turns[0]
         for nodes, buffer in sends:
@@ -175,12 +175,12 @@ class Halo:
         self.seconds["unpack"] += time.perf_counter() - waited
 
     def sum(self, values: NDArray[np.floating]) -> None:
-        """Both at once."""
+        """`start` and `finish`."""
         self.start(values)
         self.finish(values)
 
     def free(self) -> None:
-        """Give the memory back that is shared: a process may compute many runs. Collective; the halo's end."""
+        """Free the shared memory; the halo cannot be used afterwards. A process may compute many runs. Collective."""
         for *_, requests in self._turns:
             for request in requests:
                 request.Free()
@@ -191,15 +191,15 @@ class Halo:
 
 
 _NOTHING = np.empty(0)
-#: Nodes, or their places among all that are shared, and a buffer for them.
+#: Nodes, or their indices among all shared nodes, and a buffer for them.
 _Part = tuple[NDArray[np.uint32], NDArray[np.floating]]
 _Pairs = tuple[tuple[NDArray[np.floating], NDArray[np.floating]], ...]
 
 
 def _shared_buffers(world: World, buffers: dict[int, NDArray[np.floating]]) -> tuple[Any, dict[int, _Pairs]]:
-    """Shared memory, and by neighbour on this host for each of two turns the buffers written and read here.
+    """A window of shared memory, and for each neighbour on this host two pairs of buffers, written and read here.
 
-    buffers: as large as they have to be, by neighbour. Collective.
+    buffers: arrays of the sizes needed, by neighbour. Collective.
     """
     if world.comm is None:
         return None, {}
@@ -215,7 +215,7 @@ def _shared_buffers(world: World, buffers: dict[int, NDArray[np.floating]]) -> t
             begins[rank] = [end, end + size]
             end += 2 * size
     window = MPI.Win.Allocate_shared(end, 1, comm=host)
-    window.Lock_all(MPI.MODE_NOCHECK)  # which `Sync` asks for; nobody locks it otherwise
+    window.Lock_all(MPI.MODE_NOCHECK)  # required by `Sync`; there is no other lock
     of_all = dict(zip(ranks, host.allgather(begins), strict=True))
 
     def buffer(writer: int, reader: int, turn: int) -> NDArray[np.floating]:
@@ -229,5 +229,5 @@ def _shared_buffers(world: World, buffers: dict[int, NDArray[np.floating]]) -> t
     return window, pairs
 
 
-#: Buffers begin at pages: ranks that write do not share a line of a cache.
+#: Bytes; buffers start at pages, so that ranks that write do not share a cache line.
 _PAGE = 4096

@@ -35,6 +35,7 @@ def dry_run(deck: Deck, directory: Path, world: World, *, verbose: bool = False)
     terms = [(term.name, partial(term.apply, method.state)) for term in method.step.terms]
     calls, surveyed = trace_kernels(terms), trace_kernels([("check", method.check)])
     seconds, survey = forecast.measure(method)
+    run.output.keep_stable(method, {})  # allocates what a run holds
     step = sum(seconds.values())
     counts = [
         sub.rows.n_own("hexahedra"),
@@ -42,7 +43,7 @@ def dry_run(deck: Deck, directory: Path, world: World, *, verbose: bool = False)
         sub.n_nodes,
         sum(len(nodes) for _, nodes in sub.shared),
     ]
-    sizes = [distinct_bytes(calls) / sub.n_cells, _held_bytes(method) / sub.n_cells]
+    sizes = [distinct_bytes(calls) / sub.n_cells, _held_bytes(method, run.output) / sub.n_cells]
     table = world.gather([*counts, *sizes, 1e3 * step, 1e3 * survey])
     lines = _forecast(run, table[:, -2].max() / 1e3, table[:, -1].max() / 1e3)
     lines += [

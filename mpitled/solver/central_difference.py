@@ -61,7 +61,7 @@ class CentralDifference(Integrator):
         """model: figures of the model. See `Integrator`."""
         super().__init__(scene, frames, world, halo, scene.solver.load_time)
         solver = self.solver
-        self.recovers = solver.on_inversion == "recover"
+        self.recovers = scene.recovers
         self.scales_mass = solver.mass_scaling and scene.method is Method.QUASI_STATIC
         self.critical_step_by_bound = model.critical_step_typical_s
         self.end = solver.load_time + solver.hold_time
@@ -71,7 +71,6 @@ class CentralDifference(Integrator):
         self.prescribed: NDArray[np.int64] = nodes[directions == 3].astype(np.int64)  # need no mass for stability
 
     def begin(self) -> None:
-        """See `Integrator`."""
         s = self.state
         self.step.apply_forces(s)
         self.stability.evaluate(s, self.step.terms, self.safety)
@@ -132,7 +131,6 @@ class CentralDifference(Integrator):
 
     @property
     def frame_time(self) -> float:
-        """See `Integrator`."""
         return self.state.time
 
     @property
@@ -148,7 +146,6 @@ class CentralDifference(Integrator):
 
     @property
     def progress(self) -> float:
-        """See `Integrator`."""
         return self.state.time / self.end
 
     def clear(self) -> None:
@@ -157,7 +154,6 @@ class CentralDifference(Integrator):
         np.divide(self.state.time_step**2, self.sub.rows.read("mass"), out=self.state.dt2_over_m)
 
     def check(self) -> dict[str, float]:
-        """See `Integrator`."""
         s = self.state
         found = self.stability.evaluate(s, self.step.terms, self.safety)
         required = self._required()
@@ -193,7 +189,6 @@ class CentralDifference(Integrator):
         return math.sqrt(grown)
 
     def decide(self, figures: dict[str, float]) -> tuple[bool, bool]:
-        """See `Integrator`."""
         s = self.state
         due = s.time >= self.next_frame * self.frame_span - 0.5 * s.time_step
         if due:

@@ -14,7 +14,7 @@ from mpitled.deck import Deck
 from mpitled.errors import InputError
 from mpitled.parallel.halo import World
 from mpitled.parallel.subdomain import Subdomain
-from mpitled.terms.restart import Objects, Packed, Scope, Snapshot, pack, unpack
+from mpitled.terms.restart import Objects, Packed, Scope, Snapshot
 
 
 class Found(NamedTuple):
@@ -94,24 +94,22 @@ def save(
     snapshots: Mapping[str, tuple[Scope, Snapshot]],
 ) -> None:
     """Write a checkpoint with snapshots of the objects, by name, each with its scope. Collective."""
-    packed = {name: pack(objects, scope, values, sub) for name, (scope, values) in snapshots.items()}
-    nodal = {f"{name}/{key}": values for name, of in packed.items() for key, values in of.nodal.items()}
-    numbers = {f"{name}/{key}": value for name, of in packed.items() for key, value in of.reduced.items()}
-    replicated = {name: of.replicated for name, of in packed.items()}
-    contents = about | {"reduced": list(numbers), "replicated": replicated}
-    store.write_checkpoint(directory, world.comm, sub.rows, contents, nodal, list(numbers.values()))
+    packed = Packed()
+    for name, (scope, values) in snapshots.items():
+        packed.add(name, objects, scope, values, sub)
+    contents = about | {
+        "snapshots": list(snapshots), "reduced": list(packed.reduced), "replicated": packed.replicated
+    }  # fmt: skip
+    store.write_checkpoint(directory, world.comm, sub.rows, contents, packed.nodal, list(packed.reduced.values()))
 
 
 def load(found: Found, sub: Subdomain) -> Callable[[str, Objects, Scope], Snapshot | None]:
     """The function that reads a snapshot of a checkpoint by its name; None if there is none of that name."""
     nodal, table = store.read_checkpoint(found.path, sub.rows.nodes)
     numbers = dict(zip(found.contents["reduced"], table.T, strict=True))
+    packed = Packed(nodal, numbers, found.contents["replicated"])
 
     def read(name: str, objects: Objects, scope: Scope) -> Snapshot | None:
-        if name not in found.contents["replicated"]:
-            return None
-        of_nodes = {key.removeprefix(f"{name}/"): v for key, v in nodal.items() if key.startswith(f"{name}/")}
-        reduced = {key.removeprefix(f"{name}/"): v for key, v in numbers.items() if key.startswith(f"{name}/")}
-        return unpack(objects, scope, Packed(of_nodes, {}, found.contents["replicated"][name]), reduced, sub)
+        return packed.snapshot(name, objects, scope, sub) if name in found.contents["snapshots"] else None
 
     return read

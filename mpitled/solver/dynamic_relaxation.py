@@ -78,12 +78,11 @@ class DynamicRelaxation(Integrator):
     load_time: float = replicated(control=True)  # steps in which the load grows
 
     def __init__(self, scene: Scene, frames: int, world: World, halo: Halo | None) -> None:
-        """See `Integrator`."""
         super().__init__(scene, frames, world, halo, 1.0)
         sub, solver = self.sub, self.solver
         self.first_safety, self.tolerance = solver.safety, solver.tolerance
         # With load_steps = auto the method may slow the load itself.
-        self.recovers = solver.on_inversion == "recover" or solver.load_steps == "auto"
+        self.recovers = scene.recovers or solver.load_steps == "auto"
         self.load_time = self.state.load_time = self._load_steps()
         components = self.mass_components(sub)
         # kg, (1 or 6, n_nodes)
@@ -122,7 +121,6 @@ class DynamicRelaxation(Integrator):
         self.next_frame = self.frames
 
     def begin(self) -> None:
-        """See `Integrator`."""
         self.step.apply_forces(self.state)
         self._find_required()
         self.mass[:] = self.required
@@ -136,7 +134,6 @@ class DynamicRelaxation(Integrator):
 
     @property
     def frame_time(self) -> float:
-        """See `Integrator`."""
         return self.state.share
 
     @property
@@ -159,13 +156,11 @@ class DynamicRelaxation(Integrator):
         return 0.5 + 0.5 * max(0.0, min(1.0, 1 - abs(done)))
 
     def clear(self) -> None:
-        """See `Integrator`."""
         super().clear()
         for array in (self.mass, self.state.dt2_over_m, self.u_last, self.f_last):
             array[:] = 0
 
     def check(self) -> dict[str, float]:
-        """See `Integrator`."""
         s = self.state
         found = self._find_required()
         kernels.limit_mass_decrease(self.mass, self.required, self.free, MAX_MASS_DROP)

@@ -37,7 +37,7 @@ class Output:
         """halo sums three components; series: name in the result -> name of the figure."""
         self._deck, self._sub, self._halo, self._series = deck, sub, halo, series
         self.stable_figures = {}
-        self.u_last_stable = np.zeros((3, sub.n_nodes), np.float32)  # m
+        self.u_last_stable: NDArray[np.float32] | None = None  # (3, n_nodes), m
         self.writer: store.ResultWriter
 
     def open(self, directory: Any, comm: Any, metadata: Mapping[str, Any]) -> None:
@@ -55,12 +55,19 @@ class Output:
 
     def keep_stable(self, integrator: Integrator, figures: dict[str, float]) -> None:
         """Remember the present state as the last stable one."""
-        self.u_last_stable[:] = integrator.state.u[:, : self._sub.n_nodes]
+        u = integrator.state.u[:, : self._sub.n_nodes]
+        if self.u_last_stable is None:
+            self.u_last_stable = np.empty(u.shape, np.float32)
+        self.u_last_stable[:] = u
         self.stable_time, self.stable_figures = integrator.frame_time, figures
+
+    def free_stable(self) -> None:
+        """Free the last stable state before it is renewed, where something else needs as much memory meanwhile."""
+        self.u_last_stable = None
 
     def write_last_stable(self, integrator: Integrator) -> bool:
         """Write the last stable state as a frame, unless there is one of its time; whether it did. Collective."""
-        if self.stable_time <= self.last_time:
+        if self.u_last_stable is None or self.stable_time <= self.last_time:
             return False
         integrator.state.set_displacement(self.u_last_stable)
         integrator.stability.evaluate(integrator.state, integrator.step.terms, integrator.safety)

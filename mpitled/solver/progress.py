@@ -1,4 +1,4 @@
-"""How far a run is, how long each of its phases took, and who asks it to end."""
+"""Progress of a run, wall time of its phases, and signals that end it."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from contextlib import contextmanager
 from mpitled.errors import InterruptedRun
 from mpitled.parallel.halo import World
 
-#: What ends a run in order. mpirun ends its ranks itself, within a second, when it gets one of the first two; the third
-#: it passes on.
+#: Signals that end a run in order. On the first two mpirun ends its ranks itself, within a second; it passes on the
+#: third.
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
 
 _log = logging.getLogger(__name__)
@@ -35,10 +35,10 @@ class Phases:
 
 
 class Interrupts:
-    """Signals that end a run in order: at its next look, or where there are no looks at once, by the first rank."""
+    """Signals that end a run in order: at its next check, or immediately, by rank 0, where there are no checks."""
 
     def __init__(self, world: World) -> None:
-        self.asked, self.looked_for = False, False
+        self.asked, self.at_checks = False, False
         self.when = "before the first step; nothing is lost"
         self._leads = world.leads
 
@@ -52,15 +52,15 @@ class Interrupts:
 
     def _note(self, signum: int, frame: object) -> None:
         self.asked = True
-        if self._leads and not self.looked_for:
+        if self._leads and not self.at_checks:
             raise InterruptedRun(f"interrupted {self.when}")
 
 
 class Progress:
-    """How far the run is, on stderr: a bar on a terminal, a line every tenth elsewhere."""
+    """Progress on stderr: a bar on a terminal, else a line for every tenth of the run."""
 
     def __init__(self, done: float, step: int) -> None:
-        """From the share that is done, and the step, which are not 0 where a run goes on."""
+        """done, step: share and step at which the run starts; not 0 if it is resumed."""
         self.begin, self.first_done, self.first_step = time.perf_counter(), done, step
         self.tenth, self.bar = int(10 * done), None
         if sys.stderr.isatty():

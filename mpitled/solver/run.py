@@ -137,7 +137,7 @@ class Run:
             self.force_halo.seconds = dict.fromkeys(self.force_halo.seconds, 0.0)
         self._schedule_checkpoint()
         _log.info("loop")
-        interrupts.looked_for = True
+        interrupts.at_checks = True
         with self._abandoned_on_error():
             if self.figures_at_full_load is None:
                 self._advance_to_full_load()
@@ -192,7 +192,7 @@ class Run:
                 self.output.writer.abandon(figures | {"stopped": str(error)})
             raise
         finally:
-            self.interrupts.looked_for = False
+            self.interrupts.at_checks = False
             self.interrupts.when = "after the last step; 'mpitled report' makes what is missing"
             if self.progress:
                 self.progress.close()
@@ -288,6 +288,8 @@ class Run:
             except UnstableError:
                 if not self._roll_back():
                     raise
+        if integrator.state.step >= integrator.spectral_radius.next_step:
+            self.output.free_stable()
         due, last = integrator.decide(monitor.figures)
         self.output.keep_stable(integrator, monitor.figures)
         if due and self.u_full_load is None:
@@ -370,7 +372,7 @@ class Run:
         restore(objects, Scope.CHECKPOINT, read("present", objects, Scope.CHECKPOINT) or {})
         state = self.integrator.state
         state.sync_cell_copy()
-        self.output.u_last_stable[:] = state.u[:, : self.sub.n_nodes]
+        self.output.u_last_stable = state.u[:, : self.sub.n_nodes].astype(np.float32)
         self.first_step = state.step
         if self.u_full_load is None:
             self._tell(f"goes on from step {self.first_step:,} ({self.integrator.progress:.1%})")

@@ -50,8 +50,6 @@ class SpectralRadius:
         self._sub, self._world, self._forces = sub, world, forces
         self._held = sub.held % 3, sub.held // 3
         self.reference = []
-        # Scratch; single precision is enough, because the mode is tried as it is.
-        self.mode = np.zeros((3, sub.n_nodes), np.float32)
         spread = float(np.ptp(sub.rows.read("points"), axis=0).max()) if sub.n_nodes else 0.0
         # m, of the largest displacement that is tried: well above round-off, well below a cell.
         self._reach = float(np.finfo(sub.precision).eps) ** 0.5 * 0.02 * self._largest(spread)
@@ -88,7 +86,8 @@ class SpectralRadius:
 
     def _quotients(self, s: State, dt2_over_m: NDArray[np.float64]) -> Iterator[float]:
         """Rayleigh's quotients of dt2_over_m K, rising to the largest eigenvalue."""
-        rows, trial, mode = self._sub.rows, copy(s), self.mode
+        # Both arrays are freed after the estimate. Single precision is enough: the mode is tried as it is.
+        rows, trial, mode = self._sub.rows, copy(s), np.empty((3, self._sub.n_nodes), np.float32)
         trial.f = np.empty_like(s.f)
         kernels.hash_random(mode, rows.nodes)
         mode[self._held] = 0

@@ -9,7 +9,9 @@ from mpitled.terms.state import State
 from mpitled.terms.term import Scene, Term
 
 
-class _HaloTerm(Term):
+class StartHalo(Term):
+    """Sends the forces of this rank at shared nodes."""
+
     name = "halo"
     collective = True
 
@@ -21,31 +23,23 @@ class _HaloTerm(Term):
         if scene.halo is not None:
             yield cls(scene.halo)
 
-
-class StartHalo(_HaloTerm):
-    """Sends this rank's forces at shared nodes."""
-
-    def apply(self, s: State) -> None:
-        """Send."""
-        self._halo.start(s.f)
-
     @classmethod
     def left_out(cls, scene: Scene, present: bool) -> Iterable[str]:
-        """Nothing: see `FinishHalo`."""
-        return ()
-
-
-class FinishHalo(_HaloTerm):
-    """Receives the forces of other ranks and adds them."""
+        return ()  # see `FinishHalo`
 
     def apply(self, s: State) -> None:
-        """Receive and add."""
-        self._halo.finish(s.f)
+        self._halo.start(s.f)
+
+
+class FinishHalo(StartHalo):
+    """Receives the forces of other ranks and adds them."""
 
     @classmethod
     def left_out(cls, scene: Scene, present: bool) -> Iterator[str]:
-        """On one rank, and where no node is shared."""
         if scene.sub.rows.n_parts == 1:
             yield f"{cls.name}: one rank"
         elif not scene.sub.shared:
             yield f"{cls.name}: no node is shared"
+
+    def apply(self, s: State) -> None:
+        self._halo.finish(s.f)

@@ -52,14 +52,12 @@ class Reactions(Term):
 
     @classmethod
     def from_scene(cls, scene: Scene) -> Iterator[Term]:
-        """Where any dof of any rank moves."""
         if scene.anywhere(len(scene.sub.moving) > 0):
             motion = PrescribedMotion(scene.sub, owned_only=True)
             yield cls(motion, scene.method is not Method.RELAXATION, np.zeros(len(motion.dofs)))
 
     @classmethod
     def left_out(cls, scene: Scene, present: bool) -> Iterator[str]:
-        """Nodes that are moved or rotated."""
         if not len(scene.sub.moving):
             yield f"{cls.name}: no node is moved" + (" on this rank" if scene.sub.rows.n_parts > 1 else "")
         if scene.sub.moving_turns is None:
@@ -73,7 +71,6 @@ class Reactions(Term):
         )
 
     def check(self, s: State, bound: StabilityBound) -> Mapping[str, float]:
-        """The external work."""
         return {"external": self.external_work}
 
 
@@ -110,13 +107,11 @@ class CentralDifferenceUpdate(_Update):
 
     @classmethod
     def from_scene(cls, scene: Scene) -> Iterator[Term]:
-        """For all methods but relaxation."""
         if scene.method is not Method.RELAXATION:
             yield cls(scene.sub)
 
     @classmethod
     def left_out(cls, scene: Scene, present: bool) -> Iterator[str]:
-        """The method, and the copy of displacements in another precision."""
         if not present:
             yield f'central difference, mass scaling, kinetic energy: solver.method = "{scene.method.value}"'
         elif scene.method is Method.DYNAMIC:
@@ -127,7 +122,6 @@ class CentralDifferenceUpdate(_Update):
             yield f'copy of displacements for the cells: solver.precision = "{scene.solver.precision}"'
 
     def apply(self, s: State) -> None:
-        """Move the nodes and end the step."""
         m = self._motion
         kernels.update(s.u, s.u_prev, s.f, s.dt2_over_m, self._fixed, m.dofs, m.full, m.share(s), self._copy(s))
         self._end_step(s)
@@ -148,20 +142,17 @@ class RelaxationUpdate(_Update):
 
     @classmethod
     def from_scene(cls, scene: Scene) -> Iterator[Term]:
-        """For relaxation."""
         if scene.method is Method.RELAXATION:
             yield cls(scene.sub)
 
     @classmethod
     def left_out(cls, scene: Scene, present: bool) -> Iterator[str]:
-        """The method, and mass tensors."""
         if not present:
             yield f'relaxation, damping, mass tensors: solver.method = "{scene.method.value}"'
         elif not any(block.kind.meshfree for block in scene.sub.rows.blocks):
             yield "mass tensors: no support domains, whose stiffness depends on the direction"
 
     def apply(self, s: State) -> None:
-        """Move the nodes and end the step."""
         m = self._motion
         self.free_work += kernels.relax(
             s.u, s.u_prev, s.f, s.dt2_over_m, self.counted, self._fixed, m.dofs, m.full, m.share(s), s.c1, s.c2,

@@ -128,60 +128,51 @@ def restore(objects: Objects, scope: Scope, values: Snapshot) -> None:
 # --- snapshots in a checkpoint, which any number of ranks can read ----------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Packed:
-    """A snapshot in the layout of a checkpoint file."""
+    """Snapshots in the layout of a checkpoint file, by "snapshot/object.attribute"."""
 
-    nodal: dict[str, NDArray[np.floating]]  # (n owned nodes, components); after reading, of all nodes of the rank
-    reduced: dict[str, float]  # numbers of this rank
-    replicated: dict[str, Any]
+    nodal: dict[str, NDArray[np.floating]] = field(default_factory=dict)  # (n nodes, components): owned, or read: all
+    reduced: dict[str, Any] = field(default_factory=dict)  # the number of this rank; or read: (n ranks that wrote,)
+    replicated: dict[str, Any] = field(default_factory=dict)
 
-
-def pack(objects: Objects, scope: Scope, values: Snapshot, sub: Subdomain) -> Packed:
-    """This rank's share of a snapshot."""
-    packed, owned = Packed({}, {}, {}), np.flatnonzero(sub.rows.owned)
-    for key, _, _, kind in _selected(objects, scope):
-        value = values[key]
-        if kind is Kind.OWNED_DOFS:
-            dofs, of_dofs, value = _owned_moving(sub), value, np.zeros((3, sub.n_nodes))
-            value[dofs % 3, dofs // 3] = of_dofs
-        if kind in (Kind.SUM, Kind.MIN):
-            packed.reduced[key] = value
-        elif kind is Kind.REPLICATED:
-            packed.replicated[key] = value
-        elif value is not None:
-            packed.nodal[key] = np.ascontiguousarray(np.atleast_2d(value)[:, owned].T)
-    return packed
-
-
-def unpack(
-    objects: Objects, scope: Scope, packed: Packed, table: Mapping[str, NDArray[np.float64]], sub: Subdomain
-) -> Snapshot:
-    """The snapshot of this rank. table: the reduced numbers of each rank that wrote the checkpoint, (n ranks,), by key.
-
-    On another number of ranks rank 0 takes the whole of each sum.
-    """
-    values: Snapshot = {}
-    for key, _, _, kind in _selected(objects, scope):
-        if kind is Kind.REPLICATED:
-            values[key] = packed.replicated[key]
-        elif not kind.is_array:
-            numbers = table[key]
-            if len(numbers) == sub.rows.n_parts:
-                values[key] = float(numbers[sub.rows.part])
-            elif kind is Kind.MIN:
-                values[key] = float(numbers.min())
-            else:
-                values[key] = float(numbers.sum()) if sub.rows.part == 0 else 0.0
-        elif key not in packed.nodal:
-            values[key] = None
-        else:
-            value, dofs = packed.nodal[key].T, _owned_moving(sub)
+    def add(self, name: str, objects: Objects, scope: Scope, values: Snapshot, sub: Subdomain) -> None:
+        """Add this rank's share of a snapshot."""
+        owned = np.flatnonzero(sub.rows.owned)
+        for attribute, _, _, kind in _selected(objects, scope):
+            key, value = f"{name}/{attribute}", values[attribute]
             if kind is Kind.OWNED_DOFS:
-                values[key] = value[dofs % 3, dofs // 3]
+                dofs, of_dofs, value = _owned_moving(sub), value, np.zeros((3, sub.n_nodes))
+                value[dofs % 3, dofs // 3] = of_dofs
+            if not kind.is_array:
+                (self.replicated if kind is Kind.REPLICATED else self.reduced)[key] = value
+            elif value is not None:
+                self.nodal[key] = np.ascontiguousarray(np.atleast_2d(value)[:, owned].T)
+
+    def snapshot(self, name: str, objects: Objects, scope: Scope, sub: Subdomain) -> Snapshot:
+        """The snapshot of this rank. On another number of ranks than wrote it, rank 0 takes the whole of each sum."""
+        values: Snapshot = {}
+        for attribute, _, _, kind in _selected(objects, scope):
+            key = f"{name}/{attribute}"
+            if kind is Kind.REPLICATED:
+                value = self.replicated[key]
+            elif not kind.is_array:
+                numbers = self.reduced[key]
+                if len(numbers) == sub.rows.n_parts:
+                    value = float(numbers[sub.rows.part])
+                elif kind is Kind.MIN:
+                    value = float(numbers.min())
+                else:
+                    value = float(numbers.sum()) if sub.rows.part == 0 else 0.0
+            elif (rows := self.nodal.get(key)) is None:
+                value = None
+            elif kind is Kind.OWNED_DOFS:
+                dofs = _owned_moving(sub)
+                value = rows[dofs // 3, dofs % 3]
             else:
-                values[key] = value[0] if len(value) == 1 else value  # `atleast_2d` made one component of a vector
-    return values
+                value = rows[:, 0] if rows.shape[1] == 1 else rows.T  # a vector was written as one component
+            values[attribute] = value
+        return values
 
 
 def _owned_moving(sub: Subdomain) -> NDArray[np.uint32]:

@@ -25,6 +25,13 @@ class Method(str, Enum):
     RELAXATION = "dynamic-relaxation"
 
 
+class OnInversion(str, Enum):
+    """What an unstable run does: `solver.on_inversion` of the deck."""
+
+    STOP = "stop"
+    RECOVER = "recover"
+
+
 class Stage(IntEnum):
     """When a term acts in a step. Terms of one stage act in the order of the registry."""
 
@@ -75,6 +82,11 @@ class Scene:
         """How the nodes move."""
         return Method(self.solver.method)
 
+    @property
+    def recovers(self) -> bool:
+        """Whether an unstable run rolls back."""
+        return OnInversion(self.solver.on_inversion) is OnInversion.RECOVER
+
 
 @dataclass(slots=True)
 class StabilityBound:
@@ -97,7 +109,7 @@ class Term:
     must be present on all ranks or on none: decide by `Scene.anywhere`.
     """
 
-    name: str = ""  # for timers and dry runs; terms of one name are timed together
+    name: str = ""  # for timers and dry runs; terms of one name are timed together, and have no restart fields
     stage: ClassVar[Stage] = Stage.FORCES
     figures: ClassVar[tuple[Figure, ...]] = ()
     absent: ClassVar[str] = ""  # why a scene does without it
