@@ -300,15 +300,16 @@ def _report(options: argparse.Namespace) -> int:
     if cases.is_sweep(options.directory):
         return _tabulate(cases.told(options.directory), options, must=False)
     made = report.make(options.directory)
-    _print(made, report.table, options)
+    _print(made.as_json(), report.table, options)
     if options.html:
+        from mpitled.preview import dry_run
         from mpitled.results import page
 
-        report.keep(options.directory, made)
-        print(f"written to {page.write(options.directory, made)}", file=sys.stderr)
+        report.keep(options.directory, made.as_json())
+        print(f"written to {page.write(options.directory, made, dry_run.left_out)}", file=sys.stderr)
     else:
         try:
-            report.keep(options.directory, made)
+            report.keep(options.directory, made.as_json())
         except InputError as error:
             _note(error)
     return 0

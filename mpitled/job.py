@@ -20,7 +20,7 @@ from mpitled.solver import checkpoint
 from mpitled.solver.progress import Interrupts, Phases
 from mpitled.solver.run import Run
 
-MODEL, PAGE = "model.h5", "report.html"
+MODEL = "model.h5"
 #: Said of a run that is at its end.
 DONE = "done"
 
@@ -106,8 +106,8 @@ def _report(directory: Path, world: World, seconds: Mapping[str, float] | None =
     def write() -> dict[str, Any]:
         store.discard_checkpoints(directory)
         if seconds is not None:  # of a result that took the place of another
-            with atomic.writing(directory / PAGE):
-                (directory / PAGE).unlink(missing_ok=True)
+            with atomic.writing(directory / report.PAGE):
+                (directory / report.PAGE).unlink(missing_ok=True)
         return report.write(directory, seconds)
 
     return dict(world.on_leader(write))

@@ -13,7 +13,7 @@ from conftest import complaint, mpitled
 from scenes import block, pulled
 from test_labels import phantom, save
 
-from mpitled.results import field, report
+from mpitled.results import field, final_state
 from mpitled.store import results
 
 nibabel = pytest.importorskip("nibabel")
@@ -135,13 +135,13 @@ def test_the_inverse_leads_back_to_where_the_tissue_was(run):
     assert np.mean(missed < 1e-2) > 0.98
     # What is told has two digits. A jump of the field is that of the polynomials of two domains at one place.
     assert missed.max() < 1.05 * told + 1e-3
-    assert told < report.read(run.folder).metadata["deck"]["labels"]["element_size"] / 8
+    assert told < final_state.read(run.folder).metadata["deck"]["labels"]["element_size"] / 8
 
 
 def test_labels_have_the_volumes_of_the_report(run):
     told = json.loads((run.folder / "report.json").read_text())
     voxel = np.prod(VOXEL)
-    outcome = report.read(run.folder)
+    outcome = final_state.read(run.folder)
     for side, label in (("left", 5), ("right", 7)):
         in_image = run.before == label
         change = voxel * (np.count_nonzero(run.labels == label) - np.count_nonzero(in_image))
