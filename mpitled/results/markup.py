@@ -36,7 +36,7 @@ def render(template: str, **context: Any) -> str:
         "filled": _filled,
         "number_columns": _number_columns,
     }
-    return environment.get_template(template).render(policy=POLICY, **context) + "\n"
+    return environment.get_template(template).render(policy=Markup(POLICY), **context) + "\n"
 
 
 def _base64(data: bytes) -> str:
