@@ -246,8 +246,8 @@ def test_another_image_than_that_of_the_run_is_refused(run):
     assert lost.endswith(f"it has changed since {run.folder} was computed")
     larger = other(run, lambda data, affine: (np.where(np.roll(data, 1, 0) == 5, 5, data), affine))
     assert "has other labels than when" in larger
-    assert larger.endswith("give back the image that the deck was run with, or run the deck again")
-    assert "lies elsewhere than when" in other(run, lambda data, affine: (data, shifted @ affine))
+    assert larger.endswith("restore the image of the run, or run the deck again")
+    assert "has another position than when" in other(run, lambda data, affine: (data, shifted @ affine))
 
 
 def test_what_is_missing_is_told_in_a_line(run, tmp_path, monkeypatch):
@@ -256,7 +256,7 @@ def test_what_is_missing_is_told_in_a_line(run, tmp_path, monkeypatch):
         line = complaint(mpitled("export", run.folder, "--nifti", status=2))
     finally:
         moved.rename(run.image)
-    assert line == f"mpitled: {run.image}: the label image of {run.folder} is not there; put it back"
+    assert line == f"mpitled: {run.image}: the label image of {run.folder} is missing; restore it"
     assert "holds no result" in complaint(mpitled("export", tmp_path, "--nifti", status=2))
     (tmp_path / "block.toml").write_text(block((20, 20, 20), (2, 2, 2)) + pulled(0.1) + "[output]\nframes = 1\n")
     mpitled("run", "-q", tmp_path / "block.toml", "--out", tmp_path / "block")
