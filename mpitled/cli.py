@@ -300,15 +300,15 @@ def _report(options: argparse.Namespace) -> int:
     if cases.is_sweep(options.directory):
         return _tabulate(cases.told(options.directory), options, must=False)
     made = report.make(options.directory)
-    _print(made, report.table, options)
+    _print(made.as_json(), report.table, options)
     if options.html:
         from mpitled.results import page
 
-        report.keep(options.directory, made)
+        report.keep(options.directory, made.as_json())
         print(f"written to {page.write(options.directory, made)}", file=sys.stderr)
     else:
         try:
-            report.keep(options.directory, made)
+            report.keep(options.directory, made.as_json())
         except InputError as error:
             _note(error)
     return 0

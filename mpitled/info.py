@@ -196,7 +196,7 @@ def _parts() -> list[_Part]:
         package("matplotlib", "the report's pictures", "pictures", needed=False),
         package("argcomplete", "completion in the shell", "completion", needed=False),
         package("pandas", "tables in Python", "python", needed=False),
-        package("pyvista", "3-D pictures and windows, meshes in Python", "python", needed=False),
+        package("pyvista", "3-D pictures and windows, meshes in Python", "pictures", needed=False),
         package("xarray", "arrays with names in Python", "python", needed=False),
         package("tqdm", "the progress bar", "progress", needed=False),
     ]

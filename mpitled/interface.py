@@ -23,7 +23,6 @@ from mpitled.errors import InputError
 from mpitled.model import Model
 from mpitled.model import build as model_build
 from mpitled.parallel.halo import World
-from mpitled.results import views
 
 __all__ = ["Frames", "RunResult", "build_model", "load_deck", "open_result", "open_sweep", "run"]
 
@@ -187,7 +186,13 @@ class RunResult:
         and "stress" (Pa) if the run wrote it, is that of hexahedra and domains, nan of EFG nodes; "material" is the
         number of their material in the deck, from 0, or -1.
         """
-        return self._frames(lambda frame: views.grid(self._result, frame))[frame]
+        try:
+            from mpitled.results import solid
+        except ImportError as error:
+            raise InputError(
+                f"to_pyvista: {error.name} is missing; install it: pip install 'mpitled[pictures]'"
+            ) from None
+        return self._frames(lambda frame: solid.frame_grid(self._result, frame))[frame]
 
     def to_xarray(self) -> Any:
         """All frames as xarray.Dataset. InputError if they are more than a gigabyte."""

@@ -102,13 +102,13 @@ def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False, resum
 
 def _report(directory: Path, world: World, seconds: Mapping[str, float] | None = None) -> dict[str, Any]:
     """The report of a complete run; removes its checkpoints."""
-    from mpitled.results import page, report
+    from mpitled.results import report
 
     def write() -> dict[str, Any]:
         store.discard_checkpoints(directory)
         if seconds is not None:  # the result replaced another one
-            with atomic.writing(directory / page.PAGE):
-                (directory / page.PAGE).unlink(missing_ok=True)
+            with atomic.writing(directory / report.PAGE):
+                (directory / report.PAGE).unlink(missing_ok=True)
         return report.write(directory, seconds)
 
     return dict(world.on_leader(write))

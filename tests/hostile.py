@@ -365,11 +365,11 @@ def _checkpoint(path: Path) -> object:
 
 def _result(path: Path) -> object:
     from mpitled import info
-    from mpitled.results import field, report
+    from mpitled.results import field, final_state, report
 
     info.contents(path)
     with np.errstate(all="ignore"):
-        report.compute(report.read(path.parent))
+        report.compute(final_state.read(path.parent))
     return field.open_field(path)
 
 

@@ -110,7 +110,7 @@ def test_what_other_libraries_take(result):
     with package.open_result(out) as opened:
         for library, convert in (("xarray", opened.to_xarray), ("pyvista", opened.to_pyvista)):
             if importlib.util.find_spec(library) is None:
-                with pytest.raises(package.InputError, match=r"pip install 'mpitled\[python\]'"):
+                with pytest.raises(package.InputError, match=r"pip install 'mpitled\[(python|pictures)\]'"):
                     convert()
         if importlib.util.find_spec("xarray"):
             data = opened.to_xarray()

@@ -1,8 +1,7 @@
-"""The page of a run: in a real browser, with and without PyVista, of a brain and of a shape that was stopped."""
+"""The page of a run: in a real browser, with and without rendering, of a brain and of a shape that was stopped."""
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import re
 import shutil
@@ -11,13 +10,16 @@ import sys
 from itertools import combinations
 from typing import Any
 
+import markupsafe
+import numpy as np
 import pytest
 from browser import overlaps, shown
 from conftest import ENVIRONMENT, ROOT, complaint, mpitled
 
-from mpitled.results import page, report
+from mpitled.results import final_state, page, report
 
 pytest.importorskip("matplotlib")
+pytest.importorskip("pyvista")
 pytest.importorskip("nibabel")
 
 CYLINDER = """
@@ -55,10 +57,13 @@ def brain(segmentation):
 
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory):
-    """The folder of a run that cannot go on, with its page, and every figure that was drawn for it without PyVista."""
+    """The folder of a run that became unstable, with its page, and every figure drawn in this process for it.
+
+    The renderer fails, so the page has no views. The figure of the views is drawn with blank images instead.
+    """
     from matplotlib.figure import Figure
 
-    from mpitled.results import charts
+    from mpitled.results import charts, views
 
     folder = tmp_path_factory.mktemp("stopped")
     (folder / "cylinder.toml").write_text(CYLINDER)
@@ -66,40 +71,40 @@ def stopped(tmp_path_factory):
     drawn, save = [], Figure.savefig
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", lambda self, *to, **how: (drawn.append(self), save(self, *to, **how)))
-        patch.setattr(sys, "executable", shutil.which("false"))  # PyVista's process, which then fails
-        page.write(folder / "out", report.write(folder / "out"))
+        patch.setattr(sys, "executable", shutil.which("false"))  # the renderer's process, which then fails
+        page.write(folder / "out", report.make(folder / "out"))
+        patch.setattr(views, "_render", lambda *_: np.full((9, 9, 3), 255, np.uint8))
+        views.figure(final_state.read(folder / "out")).savefig(io.BytesIO())
         found = {"pushed through the interface": 4008.5, "compression of the cloud": 95.4}  # it has no tumour
         charts.draw_balance(4155.3, found, io.BytesIO())
     return folder / "out", drawn
 
 
 def sections(out):
-    return set(re.findall(r"<h2>(.*?)</h2>", (out / page.PAGE).read_text()))
+    return set(re.findall(r"<h2>(.*?)</h2>", (out / report.PAGE).read_text()))
 
 
 def test_a_page_has_what_the_scene_has(brain, stopped):
     assert sections(brain) == SECTIONS | {"Volume balance"}
-    text, made = (brain / page.PAGE).read_text(), report.compute(report.read(brain))
-    for value in (f"{made['ventricle_volume_change_ml']['left']:+.3f}", f"{made['tumour_volume_mm3']:.1f} mm"):
-        assert value in text
-    assert "away from its centre, from a radius of 2 mm to " in text
-    assert made["warnings"]
-    for warning in made["warnings"]:
-        assert warning in text
+    text, made = (brain / report.PAGE).read_text(), report.compute(final_state.read(brain))
+    assert made.warnings
+    values = [f"{made.ventricle_volume_change_ml['left']:+.3f}", f"{made.tumour_volume_mm3:.1f} mm", *made.warnings]
+    for value in (*values, "away from its centre, from a radius of 2 mm to ", "drawn by PyVista"):
+        assert str(markupsafe.escape(value)) in text
 
     out, _ = stopped
     assert sections(out) == SECTIONS
-    text = (out / page.PAGE).read_text()
+    text = (out / report.PAGE).read_text()
     assert "A cylinder &lt;squeezed&gt; &amp; more" in text
     assert re.search(r"not complete: the last frame is at [\d.]+% of the load; unstable at .*worst is", text)
-    assert "drawn by matplotlib (PyVista found no way to draw here)" in text
+    assert "There is no picture here: PyVista cannot render on this machine." in text
     assert "gather, add, add_gathered, scatter: one rank" in text
 
 
 @pytest.mark.parametrize("width", [1250, 600])
 def test_a_browser_shows_it_all_and_asks_for_nothing(tmp_path, brain, stopped, width):
-    for out, n_pictures in ((brain, 7), (stopped[0], 6)):
-        answer = shown(out / page.PAGE, width, tmp_path)
+    for out, n_pictures in ((brain, 7), (stopped[0], 5)):
+        answer = shown(out / report.PAGE, width, tmp_path)
         assert answer["said"] == answer["fetched"] == []
         assert len(answer["pictures"]) == n_pictures
         assert all(alt and across > 500 and down > 100 for alt, across, down in answer["pictures"])
@@ -110,7 +115,7 @@ def test_a_browser_shows_it_all_and_asks_for_nothing(tmp_path, brain, stopped, w
 
 def test_a_page_with_faults_is_found_out(tmp_path, stopped):
     """What the test above would not overlook."""
-    text = (stopped[0] / page.PAGE).read_text()
+    text = (stopped[0] / report.PAGE).read_text()
     bad = tmp_path / "bad.html"
     wrong = '<img alt="x" src="https://example.org/x.png"><p style="margin-top:-9rem; min-width:5000px">over it</p>'
     bad.write_text(text.replace("</figure>", "</figure>" + wrong, 1))
@@ -145,46 +150,41 @@ def test_words_in_the_pictures_do_not_overlap(monkeypatch, stopped):
         assert all(re.search(r"\(.+\)$", label) for label in labels), labels  # a unit on every axis
 
 
-def test_pyvista_draws_what_matplotlib_draws(tmp_path, brain):
-    """The same views: where one has the dark tumour, grown, so has the other."""
-    if importlib.util.find_spec("pyvista") is None:
-        pytest.skip("no pyvista")
+def test_views_show_the_grown_tumour_and_which_side_is_which(tmp_path, monkeypatch, brain):
+    """In the same scale before and after; only the outer surface of the body, of which the cloud's end is no part."""
     from matplotlib.image import imread
 
-    from mpitled.results import views
+    from mpitled.results import solid, views
 
-    assert views.draw(brain, tmp_path / "pyvista.png") == "PyVista"
-    views._draw(brain, tmp_path / "matplotlib.png", views._painter)
-    dark = [imread(tmp_path / f"{name}.png")[:, :, :3].sum(axis=2) < 0.6 for name in ("pyvista", "matplotlib")]
-    assert dark[0].shape == dark[1].shape
-    assert dark[0].mean() == pytest.approx(dark[1].mean(), rel=0.1)
+    state = final_state.read(brain)
+    meshes = solid.solid_of(state)
+    np.testing.assert_array_equal(np.unique(meshes.surface.regular_faces), state.model.node_sets["skull"])
+    assert meshes.surface.volume > 0  # normals point outwards
 
+    assert views.draw(brain, tmp_path / "views.png") == ""
+    pixels = imread(tmp_path / "views.png")[:, :, :3]
+    red, green, blue = np.moveaxis(pixels, 2, 0)
+    orange = (red > 0.3) & (green < 0.55 * red) & (green > 0.35 * red) & (blue < 0.1 * red)
+    half = len(pixels) // 2
+    grown = state.metadata["tumour"]["radius_m"] / state.metadata["tumour"]["seed_radius_m"]
+    for row in (orange[:half], orange[half : -half // 8]):  # without the legend
+        left, right = (np.count_nonzero(side) for side in np.array_split(row, 2, axis=1))
+        assert right / left == pytest.approx(grown**2, rel=0.25)
 
-def test_views_show_the_body_alone_and_say_which_side_is_which(tmp_path, monkeypatch, brain):
-    """The end of the cloud inside of it would look like a crater."""
-    import numpy as np
-    from matplotlib.figure import Figure
-
-    from mpitled.results import views
-    from mpitled.results.solid import solid_of
-
-    outcome, drawn = report.read(brain), []
-    solid = solid_of(outcome.model, outcome.moved)
-    np.testing.assert_array_equal(np.unique(solid.surface), outcome.model.node_sets["skull"])
-    monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: drawn.append(self))
-    views._draw(brain, tmp_path / "views.png", views._painter)
-    for axes in drawn[0].axes[:4]:
+    monkeypatch.setattr(views, "_render", lambda *_: np.full((9, 9, 3), 255, np.uint8))
+    figure = views.figure(state)
+    for axes in figure.axes[:4]:
         at = {text.get_text(): text.get_position()[0] for text in axes.texts}
         assert at["L"] < at["R"]
-    assert "surface of the body" in drawn[0].legends[0].get_texts()[-1].get_text()
+    assert "surface of the body" in figure.legends[0].get_texts()[-1].get_text()
 
 
 def test_what_holds_no_run_is_told_apart(tmp_path):
     deck = tmp_path / "scene.toml"
     deck.write_text(CYLINDER)
     for path, words in (
-        (tmp_path / "nowhere", "is no folder; give the one that 'mpitled run' wrote"),
-        (deck, "is no folder"),
+        (tmp_path / "nowhere", "is not a folder; give the folder that 'mpitled run' wrote"),
+        (deck, "is not a folder"),
         (tmp_path, "holds no result; give the folder"),
     ):
         assert words in complaint(mpitled("report", path, "--html", status=2))

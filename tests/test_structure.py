@@ -13,7 +13,8 @@ import pytest
 from conftest import ENVIRONMENT, ROOT
 from scenes import block, pulled
 
-from mpitled.deck import markdown_table
+from mpitled import deck
+from mpitled.results import figures
 
 PACKAGES = ("mpitled", "partition")
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
@@ -22,7 +23,7 @@ OWNERS = {
     "h5py": "mpitled.store",
     "mpi4py": "mpitled.parallel.halo",
     "pymetis": "partition.metis",
-    "pyvista": "mpitled.results.views",
+    "pyvista": "mpitled.results",
     "xarray": "mpitled.interface",
     "argcomplete": "mpitled.cli",
 }
@@ -140,9 +141,15 @@ def test_nothing_strays_at_the_top_of_the_repository():
     assert {name for name in top if not name.startswith(".")} <= TOP
 
 
-def test_the_guides_table_is_that_of_the_deck():
+@pytest.mark.parametrize(
+    ("name", "expected", "code"),
+    [
+        ("deck", deck.markdown_table, "from mpitled import deck; print(deck.markdown_table())"),
+        ("figures", figures.guide_table, "from mpitled.results import figures; print(figures.guide_table())"),
+    ],
+)
+def test_tables_of_the_guide_are_up_to_date(name, expected, code):
     readme = (ROOT / "jobs" / "README.md").read_text(encoding="utf-8")
-    _, table = readme.split("<!-- deck table -->\n")
-    table, _ = table.split("<!-- end of deck table -->")
-    remedy = "python -c 'from mpitled import deck; print(deck.markdown_table())' prints the one to put in"
-    assert table.strip() == markdown_table().strip(), remedy
+    _, table = readme.split(f"<!-- {name} table -->\n")
+    table, _ = table.split(f"<!-- end of {name} table -->")
+    assert table.strip() == expected().strip(), f"python -c '{code}' prints the table for the guide"

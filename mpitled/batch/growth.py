@@ -16,8 +16,8 @@ from mpitled.batch import launch
 from mpitled.batch.cases import Case, Sweep
 from mpitled.errors import InputError
 from mpitled.model.loading import loading_curve, sphere_radius
-from mpitled.results import report
-from mpitled.results.report import Outcome
+from mpitled.results import final_state, report
+from mpitled.results.final_state import FinalState
 
 
 def tell(sweep: Sweep) -> None:
@@ -32,7 +32,7 @@ def tell(sweep: Sweep) -> None:
     if run.failure is None or not todo:
         return
     try:
-        outcome = report.read(run.folder)
+        outcome = final_state.read(run.folder)
     except InputError as error:
         outcome = None
         failure = run.failure or str(error)
@@ -43,7 +43,7 @@ def tell(sweep: Sweep) -> None:
         launch.record(case.folder, failure, program=decks.program())
 
 
-def _tell(case: Case, run: Case, outcome: Outcome) -> str:
+def _tell(case: Case, run: Case, outcome: FinalState) -> str:
     """Write the report of one case; the reason if the run did not come so far, or ""."""
     tumour, last = case.deck.tumour, run.deck.tumour
     assert tumour is not None  # `plan` sees to it
@@ -80,11 +80,11 @@ def _tell(case: Case, run: Case, outcome: Outcome) -> str:
     return ""
 
 
-def _write(case: Case, run: Case, here: Outcome, of_run: Mapping[str, Any], off: float) -> None:
+def _write(case: Case, run: Case, here: FinalState, of_run: Mapping[str, Any], off: float) -> None:
     """off: how far (mm) the interpolation may be wrong."""
     kept = {name: of_run[name] for name in ("ranks", "nodes", "cells") if name in of_run}
     distance = {"static_distance_mm": of_run["static_distance_mm"] + off} if "static_distance_mm" in of_run else {}
     figures = kept | {"min_jacobian": float(here.jacobian.min()), "interpolation_mm": off} | distance
-    made = report.compute(replace(here, figures=figures, complete=True))
+    made = report.compute(replace(here, figures=figures, complete=True)).as_json()
     made |= {"of_run": run.folder.name, "pictures": "none, for this case is part of another's run"}
     atomic.write_text(case.folder / report.REPORT, json.dumps(made, indent=2) + "\n")

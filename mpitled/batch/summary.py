@@ -307,16 +307,15 @@ def _html(sweep: Told, table: Table, charts: Sequence[Path]) -> str:
         "cloud is uncertain by at its worst node; the volume balance, what of the grown volume was not found again.",
         "cost": "How far each case ended from rest, by its own estimate, against the time that its steps took.",
     }
-    warned = warnings(table)
-    rows = [line.cells + [line.remark] * bool(line.remark) for line in lines]
-    parts = {
-        "Results": [markup.table(headings, rows), *([markup.note(warned)] if warned else [])],
-        "Charts": [markup.picture(path.read_bytes(), alt[path.stem], captions[path.stem]) for path in charts],
-    }
-    head = [markup.text(f"{n} cases of {sweep.deck.name}, varied: {', '.join(table.keys)}", "faint")]
-    if sweep.base:
-        head.append(markup.text(f"All of them with {', '.join(sweep.base)}", "faint"))
-    head.append(
-        markup.text(f"Pages of single cases: mpitled report {sweep.cases[0].folder} --html, and so on", "faint")
+    head = [f"{n} cases of {sweep.deck.name}, varied: {', '.join(table.keys)}"]
+    head += [f"All of them with {', '.join(sweep.base)}"] if sweep.base else []
+    head.append(f"Pages of single cases: mpitled report {sweep.cases[0].folder} --html, and so on")
+    return markup.render(
+        "sweep.html",
+        title=title,
+        head=head,
+        headings=headings,
+        rows=[line.cells + [line.remark] * bool(line.remark) for line in lines],
+        warnings=warnings(table),
+        pictures=[markup.Picture(path.read_bytes(), alt[path.stem], captions[path.stem]) for path in charts],
     )
-    return markup.page(title, head, list(parts.items()))

@@ -1,4 +1,4 @@
-"""Errors of a result against a reference: another solver's field at its own places, or another result of ours."""
+"""Errors of a result against a reference: the field of another solver at its own points, or another result."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ from mpitled.readers.meshfile import FARTHEST
 from mpitled.results import field
 from mpitled.results.field import Field
 
-#: What the tags of a reference mean; fixed and moved places are prescribed, so that they say nothing of the solution.
+#: Meanings of the tags of a reference. Fixed and moved points are prescribed: their errors do not count as "free".
 TAGS = ("interior", "free surface", "fixed", "moved", "material interface")
 _PRESCRIBED = (2, 3)
-#: A reference for several tumours is used for a run whose radius is within this share of one of them.
+#: A reference for several tumours applies to a run whose tumour radius is within this share of one of theirs.
 _SAME_RADIUS = 1e-3
-_SHOWN = 4  # keys in which two scenes differ that are named
-_SAMPLES = 32  # places on each edge, for distances from it
+_SHOWN = 4  # keys in which two scenes differ that a message names
+_SAMPLES = 32  # points on each edge, for distances from it
 
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """A displacement field that is taken for true, at places of the undeformed body."""
+    """A displacement field that counts as exact, at points of the undeformed body."""
 
     places: NDArray[np.float64]  # (n, 3), m
     displacement: NDArray[np.float64]  # (n, 3), m
-    error: NDArray[np.float64] | None = None  # (n,), m: its own estimate, of the largest component
+    error: NDArray[np.float64] | None = None  # (n,), m: estimate by its authors, of the largest component
     tag: NDArray[np.int64] | None = None  # (n,), index into TAGS
-    deck: dict[str, Any] | None = None  # of a run of ours
+    deck: dict[str, Any] | None = None  # if the reference is a run of mpitled
 
 
 def compare(result: Path, reference: Path, beyond: float | None = None) -> dict[str, Any]:
-    """Figures of the difference, in mm, in the last frame of a run; `beyond` (m) makes a group of its own.
+    """Figures of the difference, in mm, in the last frame of a run.
 
-    Groups are "all", "free" (what is not prescribed), each tag of the reference, and "free beyond" that distance from
-    edges between nodes that are prescribed in all directions and free surface, where fields are singular.
+    Groups are "all", "free" (not prescribed), each tag of the reference, and with `beyond` (m) "free beyond" that
+    distance from edges between the free surface and nodes prescribed in all directions, where the field is singular.
     """
     ours = field.open_field(result)
     theirs = read_reference(reference, ours)
@@ -80,7 +80,7 @@ def compare(result: Path, reference: Path, beyond: float | None = None) -> dict[
 
 
 def table(figures: dict[str, Any]) -> str:
-    """What `compare` found, as lines for the terminal."""
+    """The figures of `compare` as a table for the terminal."""
     lines = [
         f"{figures['result']} against {figures['reference']}",
         f"{figures['in_hexahedra']} places in hexahedra, {figures['in_cloud']} in the cloud, {figures['outside']} "
@@ -89,14 +89,14 @@ def table(figures: dict[str, Any]) -> str:
     ]
     if figures["beside_the_body"]:
         lines.append(
-            f"warning: {figures['beside_the_body']} places lie more than a cell's edge outside of the body, where it "
-            "has no field: are both of one body, and in metres?"
+            f"warning: {figures['beside_the_body']} places lie outside the body by more than the edge of a cell; are "
+            "both of the same body, and in metres?"
         )
     if keys := figures["scene_differs_in"]:
         more = f" and {len(keys) - _SHOWN} more" if len(keys) > _SHOWN else ""
-        lines.append(f"note: the scenes of both differ in {', '.join(keys[:_SHOWN])}{more}")
+        lines.append(f"note: the scenes differ in {', '.join(keys[:_SHOWN])}{more}")
     if not figures["complete"]:
-        lines.append(f"the run is not finished: the field is that at {figures['load']:.1%} of the load time")
+        lines.append(f"note: the run is not complete; its last frame is at {figures['load']:.1%} of the load time")
     lines.append(
         f"{'':24}{'':>8}{'largest error, mm':>36}{'rms error, mm':>36}{'share of':>9}{'reference':>11}\n"
         f"{'':24}{'places':>8}"
@@ -115,17 +115,17 @@ def table(figures: dict[str, Any]) -> str:
 
 
 def _differing(ours: dict[str, Any], theirs: dict[str, Any] | None) -> list[str]:
-    """Keys of the scene that are not the same for both runs; none where the reference is no run."""
+    """Keys of the scene that differ between both runs; none if the reference is no run."""
     found = []
     for name, *values in deck.differences(ours, theirs or ours):
         moved = all(isinstance(value, str) for value in values) and len({Path(value).name for value in values}) == 1
-        if deck.changes_physics(name) and not moved:  # a file may lie elsewhere, and be the same
+        if deck.changes_physics(name) and not moved:  # a moved file may be the same
             found.append(name)
     return found
 
 
 def _edge(model: Model) -> float:
-    """Of a hexahedron, in the mean, m: surfaces of bodies that are meshed otherwise differ by less."""
+    """Mean edge of the hexahedra, m: the surfaces of different meshes of a body differ by less."""
     sizes = hexahedra.volumes(model.points, model.hexahedra)
     return float(np.cbrt(sizes.mean())) if len(sizes) else float("inf")
 
@@ -152,10 +152,10 @@ def _figures(reference: Reference, difference: NDArray[np.float64], chosen: NDAr
 
 
 def edge_distance(model: Model, places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances (n,), m, of places (n, 3) from edges between prescribed and free surface; infinite without any.
+    """Distances (n,), m, of places (n, 3) from edges between prescribed and free surface; infinite without an edge.
 
-    On hexahedra these are the faces' edges between faces whose nodes are all prescribed in all directions and others.
-    On a surface of EFG nodes, which has no faces, they are prescribed nodes with a free one among their three nearest.
+    On hexahedra an edge is between a face whose nodes are all prescribed in all directions and another face. A surface
+    of EFG nodes has no faces: there the prescribed nodes count that have a free node among their three nearest.
     """
     held, _ = field.prescribed(model)
     faces = field.outer_faces(model)
@@ -182,12 +182,12 @@ def edge_distance(model: Model, places: NDArray[np.float64]) -> NDArray[np.float
 def read_reference(path: Path, ours: Field) -> Reference:
     """A reference for the run: .npz, .csv, .vtu or .vtkhdf, all in metres, or another run's folder or result.
 
-    An .npz holds X (n, 3), u (n, 3) and perhaps err_u (n,) and tag (n,); u (k, n, 3) is for the k tumour radii of "R"
-    in its JSON string `meta`. A .csv has a line of names, x, y, z, ux, uy, uz and perhaps err and tag. VTK files need
-    the package vtk and a point array of displacements. InputError if there is no such file or it is not like that.
+    An .npz holds X (n, 3), u (n, 3) and optionally err_u (n,) and tag (n,); u (k, n, 3) belongs to the k tumour radii
+    of "R" in its JSON string `meta`. A .csv has a line of names, x, y, z, ux, uy, uz and optionally err and tag. VTK
+    files need PyVista and a point array of displacements. InputError if there is no such file or it is invalid.
     """
     if not path.exists():
-        raise InputError(f"{path}: is not there; give .npz, .csv, .vtu, .vtkhdf or the folder of a run")
+        raise InputError(f"{path}: does not exist; give .npz, .csv, .vtu, .vtkhdf or the folder of a run")
     if path.is_dir():
         return _of_result(path)
     if path.suffix == ".npz":
@@ -198,14 +198,14 @@ def read_reference(path: Path, ours: Field) -> Reference:
         return _of_result(path)
     if path.suffix in (".vtu", ".vtkhdf"):
         return _of_vtk(path)
-    raise InputError(f"{path}: is no reference; give .npz, .csv, .vtu, .vtkhdf or the folder of a run")
+    raise InputError(f"{path}: is not a reference; give .npz, .csv, .vtu, .vtkhdf or the folder of a run")
 
 
 def _of_result(path: Path) -> Reference:
-    """The nodes of another run, tagged by what the model says of them."""
+    """The nodes of another run, with the tags of its model."""
     theirs = field.open_field(path)
     if not theirs.complete:
-        raise InputError(f"{path}: the run did not come to its end; run it again")
+        raise InputError(f"{path}: the run is not complete; run it again")
     held, moves = field.prescribed(theirs.model)
     tag = np.zeros(theirs.model.n_nodes, np.int64)
     tag[np.unique(field.outer_faces(theirs.model))] = TAGS.index("free surface")
@@ -220,7 +220,7 @@ def _of_npz(path: Path, ours: Field) -> Reference:
     names = ("X", "u", "err_u", "tag", "meta")
     try:
         with zipfile.ZipFile(path) as archive:
-            # What is packed may be a thousand times what is in the file.
+            # The arrays may be a thousand times larger than the compressed file.
             size = sum(member.file_size for member in archive.infolist() if member.filename[:-4] in names)
         resources.check_memory(4 * size, f"{path}: its arrays", "give fewer places")
         with np.load(path, allow_pickle=False) as arrays:
@@ -228,14 +228,14 @@ def _of_npz(path: Path, ours: Field) -> Reference:
         meta = dict(json.loads(str(data.pop("meta", "{}"))))
         radii = np.asarray(meta.get("R", []), float)
         if any(values.dtype.kind not in "fiub" for values in data.values()):
-            raise ValueError("it holds other than numbers")
+            raise ValueError("an array is not numeric")
     except InputError:
         raise
-    except Exception as problem:  # of zip and numpy, which raise what they like
+    except Exception as problem:  # zip and numpy raise any kind
         reason = " ".join(str(problem).split())[:100] or type(problem).__name__
-        raise InputError(f"{path}: cannot be read as .npz ({reason}); write it anew with numpy.savez") from None
+        raise InputError(f"{path}: cannot be read as .npz ({reason}); write it again with numpy.savez") from None
     if "X" not in data or "u" not in data:
-        raise InputError(f"{path}: has no X and u; give places (n, 3) and displacements (n, 3) under these names")
+        raise InputError(f"{path}: has no arrays X and u, places (n, 3) and displacements (n, 3)")
     u, error = data["u"], data.get("err_u")
     if u.ndim == 3:
         row = _row(path, radii, len(u), ours)
@@ -250,10 +250,12 @@ def _row(path: Path, radii: NDArray[np.float64], n: int, ours: Field) -> int:
     shown = ", ".join(f"{1e3 * radius:.4g}" for radius in radii)
     tumour = ours.metadata["tumour"]
     if not tumour:
-        raise InputError(f"{path}: is of tumours of {shown} mm radius, but the run has no tumour")
+        raise InputError(f"{path}: has tumours of {shown} mm radius, but the run has no tumour")
     row = int(np.abs(radii - tumour["radius_m"]).argmin())
     if abs(radii[row] - tumour["radius_m"]) > _SAME_RADIUS * radii[row]:
-        raise InputError(f"{path}: is of tumours of {shown} mm radius, the run's has {1e3 * tumour['radius_m']:.4g} mm")
+        raise InputError(
+            f"{path}: has tumours of {shown} mm radius, the run's tumour has {1e3 * tumour['radius_m']:.4g} mm"
+        )
     return row
 
 
@@ -279,50 +281,45 @@ def _of_csv(path: Path) -> Reference:
 
 
 def _of_vtk(path: Path) -> Reference:
-    """Points and displacements of the last step of an unstructured grid of others."""
+    """Points and displacements of the last step of an unstructured grid."""
     try:
-        from vtkmodules.util.numpy_support import vtk_to_numpy
-        from vtkmodules.vtkIOHDF import vtkHDFReader
-        from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
+        import pyvista
     except ImportError:
-        raise InputError(f"{path}: to read it, install vtk: pip install vtk") from None
+        raise InputError(f"{path}: needs PyVista; install it: pip install 'mpitled[pictures]'") from None
     if path.suffix == ".vtu":
         _check_vtu(path)
-    reader: Any = vtkXMLUnstructuredGridReader() if path.suffix == ".vtu" else vtkHDFReader()
-    reader.SetFileName(str(path))
-    if path.suffix == ".vtkhdf":
-        reader.UpdateInformation()
-        reader.SetStep(max(reader.GetNumberOfSteps() - 1, 0))
-    reader.Update()
-    grid = reader.GetOutputDataObject(0)
-    if grid is None or not grid.IsA("vtkUnstructuredGrid") or not grid.GetNumberOfPoints():
+    with pyvista.vtk_verbosity("off"), damaged(path, "give an unstructured grid of VTK"):
+        reader: Any = pyvista.get_reader(path)
+        if path.suffix == ".vtkhdf":  # PyVista has no choice of the step
+            reader.reader.UpdateInformation()
+            reader.reader.SetStep(max(reader.reader.GetNumberOfSteps() - 1, 0))
+        grid: Any = reader.read()
+    if not isinstance(grid, pyvista.UnstructuredGrid) or not grid.n_points:
         raise InputError(f"{path}: cannot be read as an unstructured grid of VTK")
-    arrays = [grid.GetPointData().GetArray(i) for i in range(grid.GetPointData().GetNumberOfArrays())]
-    vectors = {array.GetName(): array for array in arrays if array and array.GetNumberOfComponents() == 3}
+    vectors = {name: array for name, array in grid.point_data.items() if array.shape == (grid.n_points, 3)}
     named = [name for name in vectors if name.lower().startswith(("u", "disp", "field_disp"))] or list(vectors)
     if len(named) != 1:
-        raise InputError(f"{path}: point vectors are {', '.join(vectors) or 'none'}; name one u or displacement")
-    places, u = vtk_to_numpy(grid.GetPoints().GetData()), vtk_to_numpy(vectors[named[0]])
-    return _checked(path, Reference(places, u))
+        raise InputError(f"{path}: has the point vectors {', '.join(vectors) or 'none'}; name one u or displacement")
+    return _checked(path, Reference(np.array(grid.points), np.array(vectors[named[0]])))
 
 
 def _check_vtu(path: Path) -> None:
-    """InputError if an XML file claims more points or cells than its bytes can make: VTK takes room for them first."""
+    """InputError if an XML file declares more points or cells than its bytes can hold: VTK allocates them first."""
     content = path.read_bytes()
     claims = [int(n) for n in re.findall(rb'NumberOf(?:Points|Cells|Tuples|Components)\s*=\s*["\'](\d{1,18})', content)]
     if max(claims, default=0) > 1000 * len(content) or re.search(rb'NumberOf\w+\s*=\s*["\']\s*[+-]?\d{19}', content):
         raise InputError(
-            f"{path}: claims {max(claims, default=0)} points or cells in {len(content)} bytes; write it anew"
+            f"{path}: declares {max(claims, default=0)} points or cells in {len(content)} bytes; write it again"
         )
 
 
 def _checked(path: Path, reference: Reference) -> Reference:
-    """The reference in float64, or an InputError if its arrays do not fit each other."""
+    """The reference in float64. InputError if its arrays do not fit together."""
     n = len(reference.places)
     for name, shape in {"places": (n, 3), "displacement": (n, 3), "error": (n,), "tag": (n,)}.items():
         array = getattr(reference, name)
         if array is not None and (array.shape != shape or not np.isfinite(array).all()):
-            raise InputError(f"{path}: {name} has shape {array.shape} for {n} places, or numbers that are not finite")
+            raise InputError(f"{path}: {name} has shape {array.shape} for {n} places, or values that are not finite")
     if not (np.abs(reference.places) < FARTHEST).all() or not (np.abs(reference.displacement) < FARTHEST).all():
         raise InputError(f"{path}: has places or displacements beyond {FARTHEST:g} m; correct them")
     if n == 0:

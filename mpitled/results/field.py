@@ -1,4 +1,4 @@
-"""The displacement field of a result at any place: trilinear in hexahedra, moving least squares in the cloud."""
+"""The displacement field of a result at any point: trilinear in hexahedra, moving least squares in the cloud."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from mpitled.mesh import CORNERS
 from mpitled.meshing.cloud import boundary_faces
 from mpitled.model import Model
 
-#: Where a value came from: inside a hexahedron, a support domain, or the hexahedron next to a place outside the mesh.
+#: Source of a value: the hexahedron around the point, a support domain, or the hexahedron nearest to a point outside.
 IN_HEXAHEDRON, IN_CLOUD, OUTSIDE = 0, 1, 2
 
-_CANDIDATES = (1, 16, 64)  # hexahedra with the nearest middles that are tried, and more where a nearer one may be
-_INSIDE = 1 + 1e-9  # in reference coordinates: a place on a face belongs to either cell
-_ITERATIONS = 30  # of Newton; sound cells need 4
-_STEPS, _STEP, _CLOSE = 12, 1e-3, 1e-6  # of Newton in the cloud: most steps, the longest, m, and a miss that is none, m
-_CHUNK = 1 << 12  # places at once, so that the temporaries stay small
+_CANDIDATES = (1, 16, 64)  # hexahedra with the nearest centres, more if a nearer hexahedron is possible
+_INSIDE = 1 + 1e-9  # in reference coordinates: a point on a face belongs to both cells
+_ITERATIONS = 30  # of Newton; undistorted cells need 4
+#: Newton in the cloud: most steps, the longest step (m), and the distance (m) at which it has converged.
+_STEPS, _STEP, _CLOSE = 12, 1e-3, 1e-6
+_CHUNK = 1 << 12  # points at once, to keep temporary arrays small
 # The eight sign products of the corners, whose coefficients make the trilinear map a polynomial.
 _r, _s, _t = CORNERS.T.astype(float)
 _MODES = np.stack([np.ones(8), _r, _s, _t, _r * _s, _s * _t, _r * _t, _r * _s * _t])
@@ -39,10 +40,10 @@ class Values(NamedTuple):
 
 
 class Origins(NamedTuple):
-    """Places of the undeformed body for places (n, 3) of the deformed one."""
+    """Points of the undeformed body for points (n, 3) of the deformed body."""
 
     place: NDArray[np.float64]  # (n, 3), m
-    missed: NDArray[np.float64]  # (n,), m: how far from the given places the field takes them
+    missed: NDArray[np.float64]  # (n,), m: distance of their deformed positions from the given points
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,19 +51,19 @@ class Field:
     """A model and the displacements of its nodes in one frame."""
 
     model: Model
-    parameters: NDArray[np.float64]  # (n_nodes, 3), m: those of EFG nodes are not the field
+    parameters: NDArray[np.float64]  # (n_nodes, 3), m; at EFG nodes they are not values of the field
     at_nodes: NDArray[np.float64]  # (n_nodes, 3), m: the field at the nodes
     basis: int
     weight: str
     share: float  # of the load time
     complete: bool  # whether the run came to its end
-    metadata: dict[str, Any]  # what the run was started with
+    metadata: dict[str, Any]  # recorded at the start of the run
 
     def at(self, places: NDArray[np.float64]) -> Values:
         """The field at places (n, 3), m, of the undeformed body.
 
-        A place beside the mesh, as those on a curved surface are, has the value that the nearest hexahedron's map
-        gives there. In the cloud the support domain of the nearest integration point gives it.
+        A point outside the mesh, for instance on a curved surface, has the value of the map of the nearest hexahedron.
+        In the cloud the support domain of the nearest integration point gives the value.
         """
         model, n = self.model, len(places)
         cells, xi, outside = locate(model.points, model.hexahedra, places)
@@ -77,11 +78,11 @@ class Field:
         return Values(displacement, source, np.where(fe, outside, 0.0))
 
     def origins(self, places: NDArray[np.float64]) -> Origins:
-        """Where in the undeformed body the tissue was that is at places (n, 3), m, of the deformed one.
+        """Undeformed positions of the tissue at points (n, 3), m, of the deformed body.
 
-        In hexahedra and beside them that is the inverse of their map, to round-off; in the cloud it is found by Newton,
-        for along the surface of a grown tumour displacements grow too steeply for a fixed-point iteration. As the field
-        jumps from one support domain to the next, a few places in the cloud are met to within such a jump only.
+        In hexahedra and outside the mesh it is the inverse of the hexahedron's map, to round-off. In the cloud Newton's
+        method finds it: near a grown tumour the gradient is too large for a fixed-point iteration. The field jumps
+        between support domains, so a few points in the cloud are only found to within such a jump.
         """
         model, n = self.model, len(places)
         cells, xi, outside = locate(model.points + self.parameters, model.hexahedra, places)
@@ -97,10 +98,10 @@ class Field:
         return Origins(found, missed)
 
     def _origins_in_cloud(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The best of a few Newton steps from the integration points that come nearest to places (n, 3).
+        """The best of a few Newton steps from the integration points whose deformed positions are nearest.
 
-        What moving least squares say inside of a tumour's seed is no tissue's: a place there is no origin, however well
-        it fits.
+        The seed of a tumour has no tissue: a point inside it is not an origin, although moving least squares has a
+        value there.
         """
         points, tumour = self.model.domain_points, self.metadata.get("tumour")
         centre, seed = (np.array(tumour["centre_m"]), tumour["seed_radius_m"]) if tumour else (np.zeros(3), 0.0)
@@ -127,8 +128,9 @@ class Field:
         return np.einsum("na,nai->ni", values, parameters), np.einsum("naj,nai->nij", gradients, parameters)
 
     def _across_interface(self, cells: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Places (n,) that lie beyond a face, an edge or a corner of their hexahedron, whichever is nearest, with
-        nothing but interface nodes; all of them where there are no hexahedra.
+        """Whether the nearest face, edge or corner of the hexahedron has interface nodes only, for points outside it.
+
+        All points are across the interface if there are no hexahedra.
         """
         if not len(self.model.hexahedra):
             return np.ones(len(cells), bool)
@@ -142,12 +144,12 @@ class Field:
 def open_field(path: Path, frame: int = -1) -> Field:
     """The field of a run's folder, or of its result.vtkhdf beside model.h5, in a frame (negative: from the last).
 
-    InputError if one of the two files is missing or they are not of one run.
+    InputError if one of the files is missing, or they do not belong together.
     """
     with store.open_result(path) as result, damaged(result.path, "run the deck again"):
         model = store.read_model(result.path.parent / "model.h5")
         if not np.array_equal(result.node_points, model.points):
-            raise InputError(f"{result.path}: is not a result of the model beside it; run the deck again")
+            raise InputError(f"{result.path}: does not belong to the model beside it; run the deck again")
         if result.n_frames == 0:
             raise InputError(f"{result.path}: has no frame; run the deck again")
         support = result.metadata["deck"]["support"]
@@ -168,8 +170,8 @@ def locate(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Cells (n,), reference coordinates in them (n, 3), and distances to them (n,), m, of places (n, 3).
 
-    Places in no hexahedron have the one that comes nearest, by the place with their coordinates cut at the faces, and
-    coordinates beyond [-1, 1]; infinitely far where there are no hexahedra.
+    A point in no hexahedron gets the nearest hexahedron, and coordinates beyond [-1, 1]. Its distance is that from the
+    point with the coordinates clipped to [-1, 1]; it is infinite without hexahedra.
     """
     n = len(places)
     cells, xi, distance = np.zeros(n, np.int64), np.zeros((n, 3)), np.full(n, np.inf)
@@ -180,7 +182,7 @@ def locate(
     tree = cKDTree(middles)
     missed = np.arange(n)
     for k in _CANDIDATES:
-        nearer = np.zeros(n, bool)  # whether a hexahedron that was not tried may come nearer
+        nearer = np.zeros(n, bool)  # whether a hexahedron that was not tried may be nearer
         for first in range(0, len(missed), _CHUNK):
             rows = missed[first : first + _CHUNK]
             apart, near = (of.reshape(len(rows), -1) for of in tree.query(places[rows], min(k, len(hexahedra))))
@@ -193,7 +195,7 @@ def locate(
 def _best(
     points: NDArray[np.float64], hexahedra: NDArray[np.int64], near: NDArray[np.int64], places: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Of candidates (n, k) the cell that holds the place or comes nearest to it; see `locate`."""
+    """Of candidates (n, k) the cell that contains the point or is nearest to it; see `locate`."""
     n, k = near.shape
     corners = points[hexahedra[near.ravel()]]
     at = np.repeat(places, k, axis=0)
@@ -202,7 +204,7 @@ def _best(
     cut = np.einsum("na,nai->ni", _shapes(np.clip(xi, -1, 1)), corners)
     distance = np.where(inside, 0.0, np.linalg.norm(cut - at, axis=1))
     distance[~converged] = np.inf
-    # Of cells that share the place the one that holds it best, so that the answer depends on the geometry only.
+    # Of cells that share the point the one that contains it best: the answer depends on the geometry only.
     order = np.lexsort((np.abs(xi).max(axis=1).reshape(n, k), distance.reshape(n, k)), axis=1)[:, 0]
     best = np.arange(n) * k + order
     return near.ravel()[best], xi[best], distance[best]
@@ -211,7 +213,7 @@ def _best(
 def _inverse(corners: NDArray[np.float64], at: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Reference coordinates (n, 3) of places (n, 3) in trilinear cells (n, 8, 3) by Newton, and where it converged.
 
-    Coordinates stay within [-8, 8]: of cells that far away nobody wants more than that they are.
+    Coordinates stay within [-8, 8]: beyond these limits it suffices that the cell is far away.
     """
     modes = _MODES @ corners / 8
     size = np.abs(modes[:, 1:4]).max(axis=(1, 2))[:, None]
@@ -222,7 +224,7 @@ def _inverse(corners: NDArray[np.float64], at: NDArray[np.float64]) -> tuple[NDA
         apart = (at[moving] - _place(some, before))[..., None]
         step = np.linalg.solve(_slopes(some, before, size[moving]), apart)[..., 0]
         xi[moving] = np.clip(before + np.clip(step, -2, 2), -8, 8)
-        # Those at a bound, which come no nearer, are done as well.
+        # Coordinates that stay at a limit are done as well.
         moving = moving[np.abs(xi[moving] - before).max(axis=1) >= 1e-13]
         if not len(moving):
             break
@@ -236,7 +238,7 @@ def _place(modes: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.fl
 
 
 def _slopes(modes: NDArray[np.float64], xi: NDArray[np.float64], size: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivatives (n, 3, 3), place by reference coordinate, with a trace of the identity lest one be singular."""
+    """Derivatives (n, 3, 3), place by reference coordinate, plus a small multiple of the identity: never singular."""
     r, s, t = (x[:, None] for x in xi.T)
     _, R, S, T, RS, ST, RT, RST = modes.transpose(1, 0, 2)
     slopes = np.stack(

@@ -1,11 +1,10 @@
-"""A result back on the grid of the label image that it came from, as NIfTI files for 3D Slicer and others of ITK.
+"""Export of a result to the grid of its label image, as NIfTI files for 3D Slicer and other programs based on ITK.
 
-Vectors are in mm along the axes of the image's world, x right, y front, z up, as NIfTI has them whichever way voxels
-run. Their files have the intent of displacements (1006), by which ITK (from 5.4 on) and Slicer (since 2023) turn them
-into axes of their own, left and back, as they read them. A field that is read as a transform is to them one that leads
-from places of the warped image to those of the image to warp: the inverse one. Where there is no tissue (outside the
-body, inside the seed before and the tumour after it has grown) displacements are zero, so that what is interpolated
-between such a voxel and the next means nothing.
+Vectors are in mm along the axes of the image's world (x right, y front, z up), whichever way the voxels run. The files
+have the intent code of displacements (1006): ITK (from 5.4) and Slicer (since 2023) convert such vectors to their own
+axes (left, back). These programs read a displacement field as a transform from points of the warped image to points of
+the image to warp, so the inverse field is the one that warps an image. Displacements are zero where there is no tissue
+(outside the body, inside the seed, inside the grown tumour); interpolation next to such voxels is meaningless.
 """
 
 from __future__ import annotations
@@ -29,35 +28,35 @@ from mpitled.results.field import Field, open_field
 DISPLACEMENT, INVERSE, LABELS = "displacement.nii.gz", "inverse_displacement.nii.gz", "labels.nii.gz"
 
 _DISPLACEMENT_VECTORS = 1006  # NIFTI_INTENT_DISPVECT
-_ALIGNED = 2  # how an affine is meant that the file itself does not have, as nibabel says it
-_VOXEL_BYTES, _BODY_BYTES = 80, 350  # of memory that a voxel takes, and one of the body beside that, at the most
-_SAME = 1e-6  # of a volume: more than its sums are off by, less than a voxel
+_ALIGNED = 2  # NIFTI_XFORM_ALIGNED_ANAT, for an image without a code of its own
+_VOXEL_BYTES, _BODY_BYTES = 80, 350  # memory for each voxel, and in addition for each voxel of the body
+_SAME = 1e-6  # relative difference of volumes: above round-off, below one voxel
 
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """What was written of a run."""
+    """The files of an export, and their accuracy."""
 
     paths: list[Path]
     tumour: int | None  # the label of the grown tumour
-    missed: float  # m: how far the two fields are from undoing each other, at the worst voxel
+    missed: float  # m: largest distance by which the inverse field misses
     share: float  # of the load
     complete: bool  # whether the run came to its end
 
 
 @dataclass(frozen=True, slots=True)
 class _Ball:
-    """The seed before, the tumour after it has grown."""
+    """The seed before the growth, or the tumour after it."""
 
     centre: NDArray[np.float64]  # (3,), m
     radius: float  # m
 
     def holds(self, places: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which places (n, 3), m, lie inside."""
+        """Whether points (n, 3), m, are inside."""
         return np.asarray(((places - self.centre) ** 2).sum(axis=1) < self.radius**2)
 
     def voxels(self, image: Image) -> Cells:
-        """The image's voxels (nz, ny, nx) whose middles lie inside."""
+        """The image's voxels (nz, ny, nx) whose centres are inside."""
         x, y, z = (
             (image.origin[i] + image.voxel[i] * (np.arange(n) + 0.5) - self.centre[i]) ** 2
             for i, n in enumerate(image.labels.shape[::-1])
@@ -68,10 +67,10 @@ class _Ball:
 def write_nifti(run: Path, directory: Path) -> Written:
     """Write the last frame of a run's folder into a directory, on the voxels of the deck's label image.
 
-    Two fields (x, y, z, 1, 3), float32: displacements of the tissue that was at the voxels' middles, and those that
-    lead from the middles back to where the tissue came from that is there now, as resampling an image asks for. And
-    the labels (x, y, z) as the tissue has carried them, with the tumour's the largest and one more. InputError if the
-    run has no image, or not the one that there is, or the disc refuses.
+    Two fields (x, y, z, 1, 3), float32: the displacements of the tissue at the undeformed centres of voxels, and the
+    vectors from the centres of voxels to the undeformed positions of the tissue that is there after the deformation
+    (for resampling an image). And the deformed labels (x, y, z), in which the tumour has a new largest label.
+    InputError if the run has no image, if the image has changed, or if a file cannot be written.
     """
     field = open_field(run)
     image, body, ventricles = _image_of(field, run)
@@ -82,14 +81,14 @@ def write_nifti(run: Path, directory: Path) -> Written:
     paths = [directory / name for name in (DISPLACEMENT, INVERSE, LABELS)]
 
     index = np.argwhere(body)
-    places = _middles(image, index)
+    places = _centres(image, index)
     displacement = field.at(places).displacement
     if seed:
         displacement[seed.holds(places)] = 0
     _write(paths[0], image, _vectors(image, index, displacement), "displacement of tissue in mm")
 
     index = np.argwhere(_reached(image, body, index, displacement))
-    places = _middles(image, index)
+    places = _centres(image, index)
     if tumour:
         tissue = ~tumour.holds(places)
         index, places = index[tissue], places[tissue]
@@ -114,11 +113,11 @@ def write_nifti(run: Path, directory: Path) -> Written:
 
 
 def _carried(image: Image, body: Cells, ventricles: Sequence[Cells], before: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Labels (n,) of voxels whose middles came from the places before (n, 3), in voxels by z, y, x.
+    """Labels (n,) of voxels with undeformed positions `before` (n, 3), in voxels by z, y, x.
 
-    It is the label of the voxel that holds the place, but for the ventricles: where all moves by less than half a
-    voxel that would change no label at all, and a ventricle that shrinks would keep its volume. So each has as many
-    voxels as its share of all of them adds up to, those with the largest shares; the mesh takes its hexahedra alike.
+    The label is that of the voxel around the position, except in ventricles: displacements below half a voxel would
+    change no label, and a ventricle that shrinks would keep its volume. Each ventricle therefore gets as many voxels as
+    its interpolated shares add up to, those with the largest shares; the mesh chooses its hexahedra in the same way.
     """
     part = np.zeros(len(before), np.int8)
     for number, mask in enumerate(ventricles, 1):
@@ -139,12 +138,12 @@ def _carried(image: Image, body: Cells, ventricles: Sequence[Cells], before: NDA
 def _image_of(field: Field, run: Path) -> tuple[Image, Cells, list[Cells]]:
     """The label image of a run, its voxels (nz, ny, nx) of the body, and those of each ventricle.
 
-    InputError if it is not there or not what it was.
+    InputError if the image is missing or has changed.
     """
     with damaged(run, "run the deck again"):
         given = field.metadata["deck"].get("labels")
         if not given:
-            raise InputError(f"--nifti: the scene of {run} has no [labels], and so no image to go back to")
+            raise InputError(f"--nifti: the scene of {run} has no [labels], and so no label image")
         labels = deck.Labels(
             image=Path(field.metadata["folder"]) / given["image"],
             element_size=1e-3 * given["element_size"],
@@ -152,9 +151,9 @@ def _image_of(field: Field, run: Path) -> tuple[Image, Cells, list[Cells]]:
             **{name: tuple(given[name]) for name in VENTRICLES},
         )
     path = labels.image
-    remedy = "give back the image that the deck was run with, or run the deck again"
+    remedy = "restore the image of the run, or run the deck again"
     if not path.is_file():
-        raise InputError(f"{path}: the label image of {run} is not there; put it back")
+        raise InputError(f"{path}: the label image of {run} is missing; restore it")
     image = read_image(path)
     try:
         body, parts, _ = parts_of(image, labels)
@@ -167,14 +166,14 @@ def _image_of(field: Field, run: Path) -> tuple[Image, Cells, list[Cells]]:
             raise InputError(f"{path}: has other labels than when {run} was computed; {remedy}")
     nodes = field.model.points[: field.model.n_fe_nodes]
     ends = image.origin + image.voxel * np.array([[f(of) for of in np.nonzero(body)[::-1]] for f in (np.min, np.max)])
-    # Hexahedra are centred on the body, and the layers that its volume takes or leaves are less than two.
+    # Hexahedra are centred on the body, which may lack or have up to two layers of them.
     if np.abs(ends - [nodes.min(axis=0), nodes.max(axis=0)]).max() > 2 * labels.element_size + image.voxel.max():
-        raise InputError(f"{path}: lies elsewhere than when {run} was computed; {remedy}")
+        raise InputError(f"{path}: has another position than when {run} was computed; {remedy}")
     return image, body, list(parts.values())
 
 
 def _balls(field: Field) -> tuple[_Ball, _Ball] | tuple[None, None]:
-    """Seed and tumour, each with the volume that the report tells: of the sphere that its nodes are a sample of."""
+    """Seed and tumour, each with the volume in the report: that of the sphere of which its nodes are a sample."""
     nodes = field.model.node_sets.get("tumour", np.empty(0, np.int64))
     if not len(nodes) or not field.metadata.get("tumour"):
         return None, None
@@ -188,14 +187,14 @@ def _balls(field: Field) -> tuple[_Ball, _Ball] | tuple[None, None]:
 
 
 def _reached(image: Image, body: Cells, index: NDArray[np.int64], displacement: NDArray[np.float64]) -> Cells:
-    """Voxels (nz, ny, nx) where the body may be by now: no farther from where it was than its surface has moved."""
+    """Voxels (nz, ny, nx) where the deformed body may be: at most the displacement of its surface away from it."""
     surface = body & ~ndimage.binary_erosion(body)
     far = np.linalg.norm(displacement[surface[tuple(index.T)]], axis=1).max()
     return np.asarray(ndimage.distance_transform_edt(~body, sampling=image.voxel[::-1]) <= far)
 
 
-def _middles(image: Image, index: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Places (n, 3), m, of the middles of voxels (n, 3), by z, y, x."""
+def _centres(image: Image, index: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Centres (n, 3), m, of voxels (n, 3), by z, y, x."""
     return image.origin + image.voxel * (index[:, ::-1] + 0.5)
 
 
@@ -208,7 +207,7 @@ def _vectors(image: Image, index: NDArray[np.int64], vectors: NDArray[np.float64
 
 def _write(path: Path, image: Image, data: NDArray[Any], about: str) -> None:
     """Write labels (nz, ny, nx) or vectors (nz, ny, nx, 3) in the order of the image file's own voxels, in mm."""
-    import nibabel  # read_image has said what to do where there is none
+    import nibabel  # read_image has raised InputError if it is missing
 
     source: Any = nibabel.load(image.path)
     affine = np.vstack([1e3 * image.to_world, [0, 0, 0, 1]])
@@ -218,7 +217,7 @@ def _write(path: Path, image: Image, data: NDArray[Any], about: str) -> None:
     vectors = data.ndim == 4
     kind = data.dtype if vectors else _kind(data, source.get_data_dtype())
     shown = own[:, :, :, None] if vectors else own
-    # A header of its own: what else that of the source says, of a person maybe, is not of this image.
+    # A new header: the header of the source may hold data of a person.
     written: Any = nibabel.Nifti1Image(shown.astype(kind, copy=False), affine, dtype=kind)
     codes = [int(source.header.get(name, 0)) for name in ("sform_code", "qform_code")]
     code = next(filter(None, codes), _ALIGNED)
@@ -228,18 +227,18 @@ def _write(path: Path, image: Image, data: NDArray[Any], about: str) -> None:
     written.header["descrip"] = f"mpitled: {about}"
     if vectors:
         written.header.set_intent(_DISPLACEMENT_VECTORS)
-    temporary = path.with_name(f".{os.getpid()}.{path.name}")  # nibabel goes by the end of the name
+    temporary = path.with_name(f".{os.getpid()}.{path.name}")  # nibabel chooses the format by the suffix
     with atomic.writing(path):
         try:
             nibabel.save(written, temporary)
             os.replace(temporary, path)
         finally:
-            with suppress(OSError):  # which would hide why nothing was written
+            with suppress(OSError):  # it would hide the first error
                 temporary.unlink()
 
 
 def _kind(labels: NDArray[np.int64], own: np.dtype[Any]) -> np.dtype[Any]:
-    """The type that the image has itself if it holds all labels, or the smallest one that does."""
+    """The type of the image itself if it can hold all labels, or the smallest that can."""
     ends = np.array([labels.min(), labels.max()])
     kinds = (own.newbyteorder("="), *map(np.dtype, (np.int16, np.int32, np.int64)))
     return next(kind for kind in kinds if (ends.astype(kind) == ends).all())

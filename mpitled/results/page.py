@@ -1,4 +1,4 @@
-"""`mpitled report DIR --html`: all that a run has to say on one page that is one file, readable anywhere."""
+"""`mpitled report DIR --html`: all results of a run on one HTML page, which is one file."""
 
 from __future__ import annotations
 
@@ -7,319 +7,280 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mpitled import atomic, store, toml
 from mpitled.deck import GEOMETRIES, unit_of
-from mpitled.results import markup, report
-from mpitled.results.report import LARGE, Outcome
-from mpitled.results.solid import Solid
+from mpitled.results import final_state, markup, report
+from mpitled.results.figures import RELAXATION, Report, rows
+from mpitled.results.final_state import FinalState
+from mpitled.results.markup import Picture
+from mpitled.results.report import LARGE, PAGE
 
-PAGE = "report.html"
-_NO_MATPLOTLIB = "There are no pictures here, for matplotlib is missing: pip install 'mpitled[pictures]'."
+_METHODS = {
+    "quasi-static": "a quasi-static ramp",
+    RELAXATION: "dynamic relaxation to the static solution",
+    "dynamic": "dynamics, with the true masses",
+}
+_Rows = list[tuple[str, ...]]
 
 
-def write(directory: Path, made: Mapping[str, Any]) -> Path:
-    """Write the page of the run in a directory, finished or not, whose report is made: report.html."""
-    atomic.write_text(directory / PAGE, _page(directory, made))
+def write(directory: Path, made: Report) -> Path:
+    """Write report.html for the run in a directory, finished or not, from its report; the path of the page."""
+    state = final_state.read(directory)
+    with store.open_result(directory) as result:
+        times, series = result.times, result.series
+    deck, metadata = dict(state.metadata["deck"]), state.metadata
+    pictures = _pictures(directory, state, made, times, series)
+    text = markup.render(
+        "run.html",
+        title=state.title,
+        method=_METHODS[deck["solver"]["method"]],
+        versions=metadata["versions"],
+        ranks=metadata["ranks"],
+        notes=_notes(made, pictures["missing"]),
+        cards=list(_cards(made)),
+        has_tumour="tumour" in deck,
+        geometry=_geometry(deck),
+        materials=_materials(state),
+        motions=_motions(deck, metadata["tumour"]),
+        deck_lines=list(toml.lines(deck)),
+        counts=_counts(state),
+        model_notes=state.model.notes,
+        displacements=_displacements(made),
+        has_cloud=state.model.n_nodes > state.model.n_fe_nodes,
+        ventricles=_ventricles(made),
+        balance_rows=_balance(made),
+        history_lines=_history(times, series, made) if len(times) > 1 else [],
+        seconds=made.seconds,
+        term_seconds=made.other.get("term_seconds"),
+        absent=metadata.get("left_out", ()),
+        figure_rows=list(rows(made.as_json())),
+        **pictures,
+    )
+    atomic.write_text(directory / PAGE, text)
     return directory / PAGE
 
 
-class _Run(NamedTuple):
-    """What the page is made from."""
-
-    directory: Path
-    outcome: Outcome
-    report: Mapping[str, Any]
-    times: NDArray[np.float64]  # (n_frames,), s, or shares of the load
-    series: Mapping[str, NDArray[np.float64]]  # (n_frames,) each
-    solid: Solid
-    draws: bool  # whether there is matplotlib
-
-    @property
-    def deck(self) -> dict[str, Any]:
-        """As it took effect, in its own units."""
-        return dict(self.outcome.metadata["deck"])
-
-    @property
-    def relaxed(self) -> bool:
-        """Whether times are shares of the load."""
-        return bool(self.deck["solver"]["method"] == "dynamic-relaxation")
+def _notes(made: Report, missing: str) -> list[list[str]]:
+    """The highlighted notes at the head of the page, a list of lines each."""
+    incomplete = [] if made.complete else [f"The run is {report.incomplete(made.as_json())}."]
+    warnings = [f"Warning: {warning}." for warning in made.warnings]
+    install = f"There are no pictures, because {missing} is missing: pip install 'mpitled[pictures]'."
+    return [lines for lines in (incomplete, warnings, [install] if missing else []) if lines]
 
 
-def _page(directory: Path, made: Mapping[str, Any]) -> str:
-    outcome = report.read(directory)
-    with store.open_result(directory) as result:
-        times, series = result.times, result.series
-    try:
-        import matplotlib  # noqa: F401  (optional: the page has tables without)
-
-        draws = True
-    except ImportError:
-        draws = False
-    run = _Run(directory, outcome, made, times, series, outcome.solid, draws)
-    sections = (
-        ("Scene", _scene(run)),
-        ("Mesh", _mesh(run)),
-        ("Cross-sections", _cross_sections(run)),
-        ("In three dimensions", _in_space(run)),
-        ("Displacement", _displacement(run)),
-        ("Volume balance", _balance(run)),
-        ("Through the run", _history(run)),
-        ("Run time", _time(run)),
-        ("All figures", _figures(run)),
-    )
-    return markup.page(outcome.title, list(_head(run)), [(heading, list(parts)) for heading, parts in sections])
-
-
-def _head(run: _Run) -> Iterator[str]:
-    made, versions = run.report, run.outcome.metadata["versions"]
-    method = {
-        "quasi-static": "a quasi-static ramp",
-        "dynamic-relaxation": "dynamic relaxation to the static solution",
-        "dynamic": "dynamics, with the true masses",
-    }[run.deck["solver"]["method"]]
-    ranks = run.outcome.metadata["ranks"]
-    yield markup.text(
-        f"{method}, computed by mpitled {versions['mpitled']} on {ranks} rank{'s' if ranks > 1 else ''}", "faint"
-    )
-    if not made["complete"]:
-        yield markup.note([f"The run is {report.incomplete(made)}."])
-    if made["warnings"]:
-        yield markup.note([f"Warning: {warning}." for warning in made["warnings"]])
-    if not run.draws:
-        yield markup.note([_NO_MATPLOTLIB])
-    yield markup.cards(_cards(made))
-
-
-def _cards(made: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    if walls := made.get("max_displacement_of_ventricle_wall_mm"):
+def _cards(made: Report) -> Iterator[tuple[str, str]]:
+    """Name and value of the most important figures."""
+    if walls := made.max_displacement_of_ventricle_wall_mm:
         yield "largest displacement of a ventricle's wall", f"{max(walls.values()):.2f} mm"
     else:
-        yield "largest displacement", f"{made['max_displacement_mm']:.2f} mm"
-    if (shift := made.get("midline_shift_mm")) is not None:
+        yield "largest displacement", f"{made.max_displacement_mm:.2f} mm"
+    if (shift := made.midline_shift_mm) is not None:
         yield "shift of the midline, to the " + ("right" if shift > 0 else "left"), f"{abs(shift):.2f} mm"
-    if change := made.get("ventricle_volume_change_ml"):
+    if change := made.ventricle_volume_change_ml:
         yield "change of the ventricles", f"{change['total']:+.3f} ml"
-    if volume := made.get("tumour_volume_mm3"):
+    if volume := made.tumour_volume_mm3:
         yield "tumour as reached", f"{volume:.1f} mm\u00b3"
-    if (smallest := made.get("min_jacobian")) is not None:
+    if (smallest := made.min_jacobian) is not None and np.isfinite(smallest):
         yield "smallest J, a cell's volume over its undeformed volume", f"{smallest:.3f}"
-    if (misfit := made.get("cloud_misfit_mm")) is not None:
+    if (misfit := made.cloud_misfit_mm) is not None:
         yield "uncertainty of the cloud, at its worst node", f"{misfit:.2f} mm"
-    if (distance := made.get("static_distance_mm")) is not None:
-        yield "still to move to the static solution, by the run's own estimate", f"{distance:.2g} mm"
+    if (distance := made.static_distance_mm) is not None:
+        yield "distance from the static solution, by the run's own estimate", f"{distance:.2g} mm"
 
 
-# --- the sections: HTML, part by part; nothing where a scene has nothing of it ---------------------------------------
+# --- tables: empty where the scene has nothing of it ---------------------------------------------------------------
 
 
-def _scene(run: _Run) -> Iterator[str]:
-    deck, model = run.deck, run.outcome.model
-    geometry = next(name for name in GEOMETRIES if name in deck)
-    chosen = [(geometry, key, value) for key, value in deck[geometry].items()]
-    chosen += [("tumour", key, value) for key, value in deck.get("tumour", {}).items()]
-    rows = [(f"{name}.{key}", f"{toml.value(value)} {unit_of(f'{name}.{key}')}".strip()) for name, key, value in chosen]
-    yield markup.table([], rows, caption="Geometry" + (" and tumour" if "tumour" in deck else ""))
-    volumes = model.volumes
-    yield markup.table(
-        ["material", "Young's modulus, Pa", "Poisson's ratio", "density, kg/m\u00b3", "cells", "volume, ml"],
-        [
-            (
-                material.name, f"{material.youngs_modulus:g}", f"{material.poissons_ratio:g}", f"{material.density:g}",
-                f"{np.count_nonzero(model.material == i):,}", f"{1e6 * volumes[model.material == i].sum():.2f}",
-            )
-            for i, material in enumerate(model.materials)
-        ],
-        caption="Materials",
-    )  # fmt: skip
-    held = [(of["nodes"], ", ".join(of["directions"]), "fixed") for of in deck.get("fixed", ())]
-    if tumour := run.outcome.metadata["tumour"]:
+def _geometry(deck: Mapping[str, Any]) -> _Rows:
+    names = (next(name for name in GEOMETRIES if name in deck), "tumour")
+    keys = [(f"{name}.{key}", value) for name in names for key, value in deck.get(name, {}).items()]
+    return [(key, f"{toml.value(value)} {unit_of(key)}".strip()) for key, value in keys]
+
+
+def _materials(state: FinalState) -> _Rows:
+    model, volumes = state.model, state.volumes
+    return [
+        (
+            material.name, f"{material.youngs_modulus:g}", f"{material.poissons_ratio:g}", f"{material.density:g}",
+            f"{np.count_nonzero(model.material == i):,}", f"{1e6 * volumes[model.material == i].sum():.2f}",
+        )
+        for i, material in enumerate(model.materials)
+    ]  # fmt: skip
+
+
+def _motions(deck: Mapping[str, Any], tumour: Mapping[str, Any] | None) -> _Rows:
+    """Nodes, directions and motion of the prescribed nodes."""
+    motions: _Rows = [(of["nodes"], ", ".join(of["directions"]), "fixed") for of in deck.get("fixed", ())]
+    if tumour:
         seed, full = (f"{1e3 * tumour[name]:.3g}" for name in ("seed_radius_m", "radius_m"))
-        held.append(("tumour", "x, y, z", f"away from its centre, from a radius of {seed} mm to {full} mm"))
+        motions.append(("tumour", "x, y, z", f"away from its centre, from a radius of {seed} mm to {full} mm"))
     for of in deck.get("displaced", ()):
         moved = f"as in {of['field']}" if "field" in of else f"{toml.value(of['displacement'])} mm"
         turn = f", turned by {of['rotation']:g} degrees about {of['axis']}" if of["rotation"] else ""
-        held.append((of["nodes"], ", ".join(of["directions"]), moved + turn))
-    if held:
-        yield markup.table(["nodes", "directions", "motion"], held, caption="Held and moved nodes")
-    yield markup.folded("The deck: every value that took effect", markup.plain(toml.lines(deck)))
+        motions.append((of["nodes"], ", ".join(of["directions"]), moved + turn))
+    return motions
 
 
-def _mesh(run: _Run) -> Iterator[str]:
-    model = run.outcome.model
-    counts = [
-        ("nodes", model.n_nodes), ("of them EFG nodes", model.n_nodes - model.n_fe_nodes),
-        ("hexahedra", len(model.hexahedra)), ("support domains", len(model.domains)),
-    ]  # fmt: skip
-    yield markup.table([], [(name, f"{count:,}") for name, count in counts])
-    if model.notes:  # the warnings stand at the top
-        yield markup.listed(model.notes)
-    if run.draws:
-        from mpitled.results import plot
-
-        yield _picture(
-            lambda to: plot.mesh(model, run.solid, run.outcome.centre).savefig(to, dpi=110),
-            "Three cuts through the undeformed mesh: hexahedra by material, and the nodes of the mesh-free cloud",
-            f"The undeformed mesh, cut {_where(run)}. Hexahedra are drawn with their edges; the cloud, which support "
-            "domains overlap in, by its nodes near the cut.",
-        )
+def _counts(state: FinalState) -> _Rows:
+    model = state.model
+    counts = {
+        "nodes": model.n_nodes, "of them EFG nodes": model.n_nodes - model.n_fe_nodes,
+        "hexahedra": len(model.hexahedra), "support domains": len(model.domains),
+    }  # fmt: skip
+    return [(name, f"{count:,}") for name, count in counts.items()]
 
 
-def _cross_sections(run: _Run) -> Iterator[str]:
-    if not run.draws:
-        return
-    if isinstance(run.report["pictures"], list):
-        pictures = {Path(name).stem: (run.directory / name).read_bytes() for name in run.report["pictures"]}
-    else:  # the deck wanted none beside the result
-        from mpitled.results import plot
-
-        drawn = plot.cuts(run.solid, run.outcome.centre, run.outcome.title)
-        pictures = {name: _png(partial(figure.savefig, dpi=160)) for name, figure in drawn}
-    for name, png in pictures.items():
-        yield markup.picture(
-            png,
-            f"Three cuts through the {name} body, coloured by displacement in mm",
-            f"The {name} body, cut {_where(run)} and coloured by how far tissue moves; both pictures have one scale.",
-        )
+def _displacements(made: Report) -> _Rows:
+    found: _Rows = [("largest", f"{made.max_displacement_mm:.2f} mm")]
+    if (outside := made.max_displacement_outside_first_ring_mm) is not None:
+        found.append(("largest, outside the tumour's first ring of cells", f"{outside:.2f} mm"))
+    for side, moved in (made.max_displacement_of_ventricle_wall_mm or {}).items():
+        found.append((f"largest, wall of the {side} ventricle", f"{moved:.2f} mm"))
+    if (shift := made.midline_shift_mm) is not None:
+        found.append((f"midline, to the {'right' if shift > 0 else 'left'}", f"{abs(shift):.2f} mm"))
+    shares = (made.share_over_5mm or {}).items()
+    return found + [(f"moved more than 5 mm, share of {of}", f"{share:.2%}") for of, share in shares]
 
 
-def _in_space(run: _Run) -> Iterator[str]:
-    if not run.draws:
-        return
-    from mpitled.results import views
-
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "views.png"
-        by = views.draw(run.directory, path)
-        shown = ", ".join(views.parts(run.solid))
-        yield markup.picture(
-            path.read_bytes(),
-            f"{shown.capitalize()} seen at an angle and from above, before and after, tissue coloured by displacement",
-            f"{shown.capitalize()} before and after, in parallel projection, drawn by {by}.",
-        )
+def _ventricles(made: Report) -> _Rows:
+    change = made.ventricle_volume_change_ml or {}
+    return [
+        (side, f"{ml:.3f}", f"{change[side]:+.3f}", f"{100 * change[side] / ml:+.2f}")
+        for side, ml in (made.ventricle_volume_ml or {}).items()
+    ]
 
 
-def _displacement(run: _Run) -> Iterator[str]:
-    made, model = run.report, run.outcome.model
-    rows = [("largest", f"{made['max_displacement_mm']:.2f} mm")]
-    if (outside := made.get("max_displacement_outside_first_ring_mm")) is not None:
-        rows.append(("largest, outside the tumour's first ring of cells", f"{outside:.2f} mm"))
-    walls = made.get("max_displacement_of_ventricle_wall_mm", {})
-    rows += [(f"largest, wall of the {side} ventricle", f"{moved:.2f} mm") for side, moved in walls.items()]
-    if (shift := made.get("midline_shift_mm")) is not None:
-        rows.append((f"midline, to the {'right' if shift > 0 else 'left'}", f"{abs(shift):.2f} mm"))
-    rows += [(f"moved more than 5 mm, share of {of}", f"{share:.2%}") for of, share in made["share_over_5mm"].items()]
-    yield markup.table([], rows)
-    if model.n_nodes > model.n_fe_nodes:
-        yield markup.text(
-            "A cloud has most of its nodes beside the tumour: their share is of the mesh, the volume's of the tissue.",
-            "faint",
-        )
-    if before := made.get("ventricle_volume_ml"):
-        change = made["ventricle_volume_change_ml"]
-        yield markup.table(
-            ["ventricle", "undeformed, ml", "change, ml", "change, %"],
-            [
-                (side, f"{ml:.3f}", f"{change[side]:+.3f}", f"{100 * change[side] / ml:+.2f}")
-                for side, ml in before.items()
-            ],
-            caption="Volume of the ventricles",
-        )
-    if run.draws and made["max_displacement_mm"] > 0:
-        from mpitled.results import charts
-
-        field = run.outcome.field
-        size = np.linalg.norm(model.at_cells(field, run.outcome.domain_displacement), axis=1)
-        volumes = model.volumes
-        yield _picture(
-            lambda to: charts.draw_histogram(1e3 * size, volumes, 1e3 * LARGE, to),
-            "Histogram: share of the body's volume in % against displacement in mm",
-            "How much of the body's volume moves how far, by cells.",
-        )
+def _found_volumes(made: Report) -> dict[str, float]:
+    """Where the volume that the tumour added was found, mm^3; empty without a balance or growth."""
+    if not made.volume_added_mm3 or made.volume_added_mm3 <= 0:
+        return {}
+    assert made.volume_pushed_mm3 is not None
+    assert made.volume_compressed_mm3 is not None
+    return {
+        "pushed through the interface": made.volume_pushed_mm3, "compression of the cloud": made.volume_compressed_mm3
+    }  # fmt: skip
 
 
-def _balance(run: _Run) -> Iterator[str]:
-    balance = run.report.get("volume_balance", {})
-    if (grown := balance.get("tumour_added_mm3", 0.0)) <= 0:
-        return
-    found = {
-        "pushed through the interface": balance["pushed_through_interface_mm3"],
-        "compression of the cloud": balance["elastic_compression_mm3"],
-    }
-    rows = [("added by the tumour", f"{grown:.1f}")] + [(name, f"{volume:.1f}") for name, volume in found.items()]
-    rest = report.unfound(balance)
-    rows.append(("not found", f"{rest:.1f}") if rest >= 0 else ("found beyond what was added", f"{-rest:.1f}"))
-    yield markup.table(["volume", "mm\u00b3"], rows)
-    if run.draws:
-        from mpitled.results import charts
-
-        yield _picture(
-            lambda to: charts.draw_balance(grown, found, to),
-            f"Bars: of {grown:.0f} cubic millimetres added, {sum(found.values()):.0f} were found again",
-            "What the tumour added is either pushed through the end of the cloud or compresses it; the rest is error.",
-        )
+def _balance(made: Report) -> _Rows:
+    if not (found := _found_volumes(made)):
+        return []
+    rest = made.volume_unaccounted_mm3
+    ends = {"not found": rest} if rest >= 0 else {"found beyond what was added": -rest}
+    volumes = {"added by the tumour": made.volume_added_mm3} | found | ends
+    return [(name, f"{volume:.1f}") for name, volume in volumes.items()]
 
 
-def _history(run: _Run) -> Iterator[str]:
-    """At the frames that were written: more of them with output.frames."""
-    if len(run.times) < 2:
-        yield markup.text("One frame was written, the undeformed body: there is nothing to show over time yet.")
-        return
-    label = "share of the load (1)" if run.relaxed else "time (s)"
-    if run.draws:
-        from mpitled.results import charts
-
-        yield _picture(
-            lambda to: charts.draw_history(run.times, run.series, label, to),
-            "Three charts over the run: energies, kinetic over internal energy in %, and the smallest J",
-            f"At the {len(run.times)} frames that were written. J is the volume of a cell over its undeformed volume."
-            + " Masses are fictitious in relaxation, and so is kinetic energy. They are made anew as the load grows, "
-            "which gives and takes energy: the balance counts it, and internal energy may be more than external work."
-            * run.relaxed,
-        )
-    series = run.series
-    yield markup.folded("The numbers, energies in J", markup.plain(_columns({label: run.times, **series})))
+def _time_label(made: Report) -> str:
+    return "share of the load (1)" if made.method == RELAXATION else "time (s)"
 
 
-def _columns(series: Mapping[str, NDArray[np.float64]]) -> Iterator[str]:
-    yield "  ".join(f"{name:>{max(11, len(name))}}" for name in series)
-    for row in zip(*series.values(), strict=True):
-        yield "  ".join(f"{value:{max(11, len(name))}.4g}" for name, value in zip(series, row, strict=True))
-
-
-def _time(run: _Run) -> Iterator[str]:
-    made = run.report
-    yield markup.bars("Phases of the run", "s", list(made["seconds"].items()))
-    if terms := made.get("term_seconds"):
-        yield markup.folded("Terms of the loop's steps", markup.bars("On rank 0", "s", list(terms.items())))
-    ranks = run.outcome.metadata["ranks"]
-    where = ", here on rank 0:" if ranks > 1 else ":"
-    yield markup.folded(
-        "What the steps do without",
-        markup.text(f"A term or an array that a scene does not need is not in its steps{where}"),
-        markup.listed(run.outcome.metadata.get("left_out", ())),
-    )
-
-
-def _figures(run: _Run) -> Iterator[str]:
-    yield markup.table([], report.rows(run.report))
-    versions = run.outcome.metadata["versions"]
-    yield markup.text("Versions: " + ", ".join(f"{name} {version}" for name, version in versions.items()), "faint")
+def _history(times: NDArray[np.float64], series: Mapping[str, NDArray[np.float64]], made: Report) -> list[str]:
+    """The series at the frames, in columns of text."""
+    columns = {_time_label(made): times, **series}
+    widths = [max(11, len(name)) for name in columns]
+    lines = [zip(columns, widths, strict=True)]
+    lines += [
+        zip((f"{value:.4g}" for value in row), widths, strict=True) for row in zip(*columns.values(), strict=True)
+    ]
+    return ["  ".join(f"{cell:>{width}}" for cell, width in line) for line in lines]
 
 
 # --- pictures ------------------------------------------------------------------------------------------------------
 
 
-def _where(run: _Run) -> str:
-    return "through the middle" if run.outcome.centre is None else "through the tumour's centre"
+def _pictures(
+    directory: Path,
+    state: FinalState,
+    made: Report,
+    times: NDArray[np.float64],
+    series: Mapping[str, NDArray[np.float64]],
+) -> dict[str, Any]:
+    """The pictures of the page by their names in the template, and "missing", a library or ""."""
+    none: dict[str, Any] = {
+        "mesh_picture": None,
+        "cuts": [],
+        "views": None,
+        "no_views": "",
+        "histogram": None,
+        "balance_chart": None,
+    }
+    none |= {"history_chart": None}
+    try:
+        from mpitled.results import charts, cuts, solid
+    except ImportError as error:
+        return none | {"missing": str(error.name).partition(".")[0]}
+    found, mesh = _found_volumes(made), solid.solid_of(state)
+    where = "through the middle" if state.centre is None else "through the tumour's centre"
+    pictures = none | {
+        "missing": "",
+        "mesh_picture": Picture(
+            _png(partial(cuts.mesh(state, mesh).savefig, dpi=110)),
+            "Three cuts through the undeformed mesh: hexahedra by material, and the nodes of the mesh-free cloud",
+            f"The undeformed mesh, cut {where}. Hexahedra are drawn with their edges; the cloud, whose support domains "
+            "overlap, with its nodes near the cut.",
+        ),
+        "cuts": [
+            Picture(
+                png,
+                f"Three cuts through the {name} body, coloured by displacement in mm",
+                f"The {name} body, cut {where} and coloured by the displacement; both pictures have the same scale.",
+            )
+            for name, png in _cut_pictures(directory, made, lambda: cuts.displacement_cuts(state, mesh))
+        ],
+    } | _views(directory, state)  # fmt: skip
+    if made.max_displacement_mm > 0:
+        sizes = 1e3 * state.cell_displacements
+        pictures["histogram"] = Picture(
+            _png(partial(charts.draw_histogram, sizes, state.volumes, 1e3 * LARGE)),
+            "Histogram: share of the body's volume in % against displacement in mm",
+            "The share of the body's volume for each displacement, by cells.",
+        )
+    if found:
+        pictures["balance_chart"] = Picture(
+            _png(partial(charts.draw_balance, made.volume_added_mm3 or 0.0, found)),
+            f"Bars: of {made.volume_added_mm3:.0f} mm3 added, {sum(found.values()):.0f} mm3 were found again",
+            "The added volume is pushed through the end of the cloud or compresses the cloud; the rest is error.",
+        )
+    if len(times) > 1:
+        caption = f"At the {len(times)} frames that were written. J is the volume of a cell over its undeformed volume."
+        if made.method == RELAXATION:
+            caption += (
+                " In relaxation the masses are fictitious, and so is the kinetic energy. The masses are updated as the "
+                "load grows, which adds or takes energy. The balance includes it; the internal energy may exceed the "
+                "external work."
+            )
+        pictures["history_chart"] = Picture(
+            _png(partial(charts.draw_history, times, series, _time_label(made))),
+            "Three charts over the run: energies, kinetic over internal energy in %, and the smallest J",
+            caption,
+        )
+    return pictures
 
 
-def _picture(draw: Callable[[io.BytesIO], Any], alt: str, caption: str) -> str:
-    return markup.picture(_png(draw), alt, caption)
+def _cut_pictures(directory: Path, made: Report, draw: Callable[[], Iterator[Any]]) -> Iterator[tuple[str, bytes]]:
+    """Name and PNG of the cuts: those beside the result, or new ones if the deck turned them off."""
+    if isinstance(made.pictures, list):
+        yield from ((Path(name).stem, (directory / name).read_bytes()) for name in made.pictures)
+    else:
+        yield from ((name, _png(partial(figure.savefig, dpi=160))) for name, figure in draw())
+
+
+def _views(directory: Path, state: FinalState) -> dict[str, Any]:
+    from mpitled.results import views
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "views.png"
+        if failure := views.draw(directory, path):
+            return {"no_views": failure}
+        png = path.read_bytes()
+    shown = ", ".join(views.part_names(state)).capitalize()
+    alt = f"{shown} seen at an angle and from above, before and after, tissue coloured by displacement"
+    return {"views": Picture(png, alt, f"{shown} before and after, in parallel projection, drawn by PyVista.")}
 
 
 def _png(draw: Callable[[io.BytesIO], Any]) -> bytes:

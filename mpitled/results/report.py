@@ -1,7 +1,7 @@
-"""What a user asks of a run, in the user's units: report.json, a table, and pictures.
+"""The report of a run, in the user's units: report.json, a table for the terminal, and pictures.
 
-All displacements are those of the field u_h: at EFG nodes that is not their parameter (a tumour's surface, which moves
-as prescribed, is the exception, and is reported both ways).
+All displacements are those of the field u_h, which at EFG nodes is not their parameter. The surface of a tumour, which
+moves as prescribed, is the exception: both of its volumes are reported.
 """
 
 from __future__ import annotations
@@ -10,105 +10,68 @@ import json
 import math
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import atomic, store
+from mpitled import atomic
 from mpitled.cells import hexahedra
-from mpitled.errors import InputError, damaged
 from mpitled.meshing.cloud import boundary_faces, interface_faces
 from mpitled.model import Model
-from mpitled.results.solid import Solid, solid_of
+from mpitled.results.figures import BY_KEY, RELAXATION, LowestJacobian, Report, rows
+from mpitled.results.final_state import FinalState, read
 
-REPORT, MODEL = "report.json", "model.h5"
-#: Displacements beyond this are large (paper, 6.2), m.
+REPORT, PAGE = "report.json", "report.html"
+#: Displacements above this are large (paper, 6.2), m.
 LARGE = 5e-3
-#: What is warned of: energy of hourglass control and stabilisation as a share of the internal energy (right results
-#: have had up to 0.15, wrong ones from 0.3); a wrong volume balance; a distance to the static solution, and a misfit of
-#: the cloud, mm.
-ARTIFICIAL, UNBALANCED, FAR = 0.2, 0.05, 0.5
-#: Poisson's ratios above this are nearly incompressible; cells below this J have lost much.
-INCOMPRESSIBLE, CRUSHED = 0.495, 0.5
-#: What is warned of: volume in such cells as a share of the tumour's.
-MUCH_CRUSHED = 0.02
-VENTRICLES = {"left": "left_ventricle", "right": "right_ventricle"}
-#: Exact to degree 3 in each coordinate; a bilinear face's volume integrand has degree 2.
+#: The report warns if hourglass control and stabilisation have more than this share of the internal energy. Right
+#: results had up to 0.15, wrong ones 0.3 or more.
+MAX_ARTIFICIAL_ENERGY = 0.2
+#: Materials with a larger Poisson's ratio are nearly incompressible.
+NEARLY_INCOMPRESSIBLE = 0.495
+#: Cells with a smaller J lost much of their volume. The report warns if their volume is more than this share of the
+#: tumour's.
+LOW_JACOBIAN, MAX_LOW_JACOBIAN_VOLUME = 0.5, 0.02
+#: Gauss points, exact to degree 3 in each coordinate; the volume integrand of a bilinear face has degree 2.
 _GAUSS = (-(3**-0.5), 3**-0.5)
 
+_Floats = NDArray[np.float64]
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """The model and where a run took it, at the last frame; SI units and the model's order."""
 
-    model: Model
-    field: NDArray[np.float64]  # (n_nodes, 3), m, u_h
-    displacement: NDArray[np.float64]  # (n_nodes, 3), m, as prescribed or computed: parameters at EFG nodes
-    domain_displacement: NDArray[np.float64]  # (n_domains, 3), m, u_h at integration points
-    jacobian: NDArray[np.float64]  # (n_cells,)
-    time: float  # s
-    complete: bool  # whether the run came to its end
-    metadata: dict[str, Any]  # what it was started with
-    figures: dict[str, Any]  # what it ended with; empty if it was killed
-
-    @property
-    def title(self) -> str:
-        """Of the scene; there is always one."""
-        return self.metadata.get("title") or "mpitled"
-
-    @property
-    def seed(self) -> NDArray[np.int64]:
-        """Nodes on the surface of the tumour; none without one."""
-        return self.model.node_sets.get("tumour", np.empty(0, np.int64))
-
-    @property
-    def centre(self) -> NDArray[np.float64] | None:
-        """The tumour's centre (3,), m."""
-        tumour = self.metadata.get("tumour")
-        return np.array(tumour["centre_m"]) if tumour else None
-
-    @property
-    def moved(self) -> NDArray[np.float64]:
-        """(n_nodes, 3), m: the field, and the tumour's surface as prescribed."""
-        moved = self.field.copy()
-        moved[self.seed] = self.displacement[self.seed]
-        return moved
-
-    @property
-    def solid(self) -> Solid:
-        """As it is drawn; made at each call."""
-        return solid_of(self.model, self.moved, anatomical="labels" in self.metadata.get("deck", {}))
+# --- files ---------------------------------------------------------------------------------------------------------
 
 
 def write(directory: Path, seconds: Mapping[str, float] | None = None) -> dict[str, Any]:
-    """Make the report of the run in a directory, and keep it; errors as both."""
-    report = make(directory, seconds)
+    """Make the report of the run in a directory and write report.json; the content of report.json.
+
+    Errors are those of `make` and `keep`.
+    """
+    report = make(directory, seconds).as_json()
     keep(directory, report)
     return report
 
 
-def make(directory: Path, seconds: Mapping[str, float] | None = None) -> dict[str, Any]:
-    """Compute the report of the run in a directory, and draw the pictures there, if it lets itself be written.
+def make(directory: Path, seconds: Mapping[str, float] | None = None) -> Report:
+    """Compute the report of the run in a directory, and draw its pictures there if the directory can be written.
 
-    `seconds` are the phases of a run that is at its end. InputError if the directory holds no results, or they and
-    the model do not belong together.
+    `seconds` are the phases of a run that ends now. InputError if the directory holds no result, or the result and the
+    model do not belong together.
     """
     begin = time.perf_counter()
     directory = Path(directory)
-    outcome = read(directory)
-    report = compute(outcome)
-    report["pictures"] = _draw(outcome, directory)
-    phases = dict(seconds or report.get("seconds", {}))
+    state = read(directory)
+    report = compute(state)
+    report.pictures = _draw(state, directory)
+    phases = dict(seconds or report.seconds or {})
     took = {"report": time.perf_counter() - begin} if seconds else _first_report(directory, phases)
-    report["seconds"] = phases | took
-    return dict(_without_nan(report))
+    report.seconds = phases | took
+    return report
 
 
 def _first_report(directory: Path, phases: Mapping[str, float]) -> dict[str, float]:
-    """What the run itself took for its report: looking at it again must not change how long it ran."""
+    """Time of the report at the end of the run, which a later report of the same run keeps."""
     try:
         kept = dict(json.loads((directory / REPORT).read_text(encoding="utf-8"))["seconds"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -117,151 +80,186 @@ def _first_report(directory: Path, phases: Mapping[str, float]) -> dict[str, flo
 
 
 def keep(directory: Path, report: Mapping[str, Any]) -> None:
-    """Write report.json into the run's directory. InputError if the disc refuses."""
+    """Write report.json into the run's directory. InputError if the file cannot be written."""
     atomic.write_text(directory / REPORT, json.dumps(report, indent=2, allow_nan=False) + "\n")
 
 
-def read(directory: Path) -> Outcome:
-    """The last frame of the run in a directory, and its model; errors as `write`."""
-    if not directory.is_dir():
-        raise InputError(f"{directory}: is no folder; give the one that 'mpitled run' wrote")
-    with store.open_result(directory) as result, damaged(result.path, "run the deck again"):
-        if result.n_frames == 0:
-            raise InputError(f"{result.path}: holds no frame yet; run the deck again")
-        model = store.read_model(directory / MODEL)
-        if not np.array_equal(result.node_points, model.points) or len(result.in_cells("J")) != model.n_cells:
-            raise InputError(f"{result.path}: is not of the model beside it, {MODEL}; run the deck again")
-        return Outcome(
-            model=model,
-            field=result.at_nodes("displacement", -1),
-            displacement=result.at_nodes("parameters", -1),
-            domain_displacement=result.at_integration_points("displacement", -1),
-            jacobian=result.in_cells("J", -1),
-            time=float(result.times[-1]),
-            complete=result.complete,
-            metadata=result.metadata,
-            figures=result.figures,
-        )
-
-
-def compute(outcome: Outcome) -> dict[str, Any]:
-    """The report as plain numbers by key; what a scene does not have is absent."""
-    model, field = outcome.model, outcome.field
-    size = np.linalg.norm(field, axis=1)
-    fe_volumes = hexahedra.volumes(model.points, model.hexahedra)
-    volumes = model.volumes
-    at_cells = model.at_cells(field, outcome.domain_displacement)
-    large = np.linalg.norm(at_cells, axis=1) > LARGE
-    report: dict[str, Any] = {
-        "title": outcome.metadata.get("title", ""),
-        "complete": outcome.complete,
-        "load_share": min(1.0, outcome.time / outcome.metadata["load_time_s"]),
-        "max_displacement_mm": 1e3 * float(size.max()),
-        "share_over_5mm": {
-            "volume": float(volumes[large].sum() / volumes.sum()),
-            "nodes": float(np.mean(size > LARGE)),
-        },
-    }
-    if len(outcome.seed):
-        outside = np.linalg.norm(_outside_first_ring(outcome), axis=1)
-        if len(outside):
-            report["max_displacement_outside_first_ring_mm"] = 1e3 * float(outside.max())
-    if model.n_nodes > model.n_fe_nodes:
-        # What the cloud's polynomials leave of the values that they are fitted to: where that is much they cannot
-        # follow the field, which is then wrong by about as much (told 0.8 to 3.8 times, in 14 grown spheres).
-        misfit = np.linalg.norm((outcome.field - outcome.displacement)[model.n_fe_nodes :], axis=1)
-        report["cloud_misfit_mm"] = 1e3 * float(misfit.max())
-        report["cloud_misfit_of_90_percent_mm"] = 1e3 * float(np.quantile(misfit, 0.9))
-    report |= _ventricles(outcome, fe_volumes)
-    if outcome.centre is not None and len(outcome.seed):
-        report |= _tumour(outcome, outcome.centre)
-    report |= _smallest(outcome, volumes) | outcome.figures
-    if solver := outcome.metadata.get("deck", {}).get("solver"):
-        report["method"] = solver["method"]
-        if solver["method"] == "dynamic-relaxation":  # whose time is fictitious
-            report.pop("time_step_s", None)
-    # What there is of a run that was stopped is not taken for a result, and its figures are off for that reason.
-    report["warnings"] = [*model.warnings, *(_warnings(report, model) if outcome.complete else ())]
-    return report
-
-
-def unfound(balance: Mapping[str, float]) -> float:
-    """What of the added volume (mm^3) a volume balance did not find; below 0 if it found more."""
-    return balance["tumour_added_mm3"] - balance["pushed_through_interface_mm3"] - balance["elastic_compression_mm3"]
-
-
-def _warnings(report: Mapping[str, Any], model: Model) -> list[str]:
-    """Why a result may not be what it seems, and the remedy."""
-    found = []
-    relaxed = report.get("method") == "dynamic-relaxation"
-    energy = report.get("energy_J", {})
-    if energy.get("internal", 0) > 0:
-        share = (energy["hourglass"] + energy["stabilisation"]) / energy["internal"]
-        if share > ARTIFICIAL:
-            # What resists these modes is a share of lambda + 2 mu, which has no bound towards 0.5.
-            stiff = max(material.poissons_ratio for material in model.materials) > INCOMPRESSIBLE
-            remedy = "lower material.NAME.poissons_ratio (0.49)" if stiff else "raise support.stabilisation"
-            found.append(
-                f"{share:.0%} of the internal energy is in modes that no cell's strain sees, so the displacements are "
-                f"not to be trusted: refine the mesh or the cloud, or {remedy}"
-            )
-    balance = report.get("volume_balance", {})
-    if (error := balance.get("relative_error", 0.0)) > UNBALANCED:
-        wrong = "of the grown volume is lost" if unfound(balance) > 0 else "more volume is displaced than was grown"
-        found.append(f"{error:.0%} {wrong}: refine the cloud around the tumour (cloud.growth)")
-    crushed, tumour = report["crushed"]["volume_mm3"], report.get("tumour_volume_mm3", math.inf)
-    if crushed > MUCH_CRUSHED * tumour:
-        found.append(
-            f"{crushed:.3g} mm3 of tissue, {crushed / tumour:.1%} of the tumour's volume, is in cells that lost over "
-            "half of theirs: beside the tumour the field is not to be trusted; refine the cloud there (cloud.growth)"
-        )
-    if (misfit := report.get("cloud_misfit_mm", 0.0)) > FAR:
-        # Next to a grown seed the spacing on its surface decides, and a finer cloud behind it changes little.
-        keys = "raise tumour.surface_nodes: four times as many halve it" if "volume_balance" in report else ""
-        most = report["cloud_misfit_of_90_percent_mm"]
-        found.append(
-            f"the cloud is too coarse for its field, which is uncertain by {misfit:.2g} mm at its worst node, and by "
-            f"{most:.2g} mm at most at 90 % of its nodes: refine it there ({keys or 'lower cloud.spacing'})"
-        )
-    if (distance := report.get("static_distance_mm", 0.0)) > FAR:
-        remedy = 'load more slowly (solver.load_time), or take solver.method = "dynamic-relaxation"'
-        found.append(
-            f"the run ended {distance:.2g} mm from the static solution: "
-            f"{'lower solver.tolerance' if relaxed else remedy}"
-        )
-    elif report.get("method") == "quasi-static" and "static_distance_mm" not in report:
-        found.append(
-            "how far the ramp ended from the static solution could not be found: load more slowly (solver.load_time), "
-            'or take solver.method = "dynamic-relaxation"'
-        )
-    return found
+def _draw(state: FinalState, directory: Path) -> list[str] | str:
+    """Names of the pictures that were drawn, or why there are none."""
+    if not state.metadata.get("deck", {}).get("output", {}).get("pictures", True):
+        return "none, because output.pictures is false"
+    try:
+        from mpitled.results import cuts
+    except ImportError as error:
+        library = str(error.name).partition(".")[0]
+        return f"none, because {library} is missing; install it: pip install 'mpitled[pictures]'"
+    try:
+        return cuts.draw(directory, state)
+    except OSError as error:
+        return f"none, because they cannot be written ({error.strerror})"
 
 
 def incomplete(report: Mapping[str, Any]) -> str:
-    """What there is of a run that did not come to its end, and why, if it could say so."""
+    """The last frame of a run that did not come to its end, and the reason if the run recorded it."""
     stopped = f"; {report['stopped']}" if "stopped" in report else ""
     return f"not complete: the last frame is at {report['load_share']:.1%} of the load{stopped}"
 
 
 def table(report: Mapping[str, Any], *, whole: bool = True) -> str:
-    """The report for people to read, or the few figures that decide what to do next; what is absent is absent here."""
+    """The content of report.json as a table for the terminal, or its headlines only."""
     lines = [report["title"]] if report["title"] else []
     if not report["complete"]:
         lines.append(incomplete(report))
-    lines += [f"  {name:<47}  {value}" for name, value in rows(report, whole=whole)]
+    lines += [f"  {name:<47}  {value}" for name, value in rows(report, headlines=not whole)]
     lines += [f"  warning: {text}" for text in report["warnings"]]
     pictures = report["pictures"]
     lines.append(f"  {'pictures':<47}  {', '.join(pictures) if isinstance(pictures, list) else pictures}")
     return "\n".join(lines)
 
 
-# --- what is computed ----------------------------------------------------------------------------------------------
+# --- figures -------------------------------------------------------------------------------------------------------
 
 
-def enclosed_volume(points: NDArray[np.float64], faces: NDArray[np.int64]) -> float:
+def compute(state: FinalState) -> Report:
+    """The report of a state, without pictures and phases."""
+    report = Report(
+        title=state.metadata.get("title", ""),
+        complete=state.complete,
+        load_share=min(1.0, state.time / state.metadata["load_time_s"]),
+    )
+    for measure in (_displacements, _cloud, _ventricles, _tumour, _jacobians):
+        measure(report, state)
+    report.set_figures(state.figures)
+    if solver := state.metadata.get("deck", {}).get("solver"):
+        report.method = solver["method"]
+        if report.method == RELAXATION:
+            report.time_step_s = None  # the time of relaxation is fictitious
+    # The figures of a run that was stopped are wrong for that reason: further warnings would mislead.
+    report.warnings = [*state.model.warnings, *(_warnings(report, state.model) if state.complete else ())]
+    return report
+
+
+def _displacements(report: Report, state: FinalState) -> None:
+    size = np.linalg.norm(state.field, axis=1)
+    large = state.cell_displacements > LARGE
+    report.max_displacement_mm = 1e3 * float(size.max())
+    report.share_over_5mm = {
+        "volume": float(state.volumes[large].sum() / state.volumes.sum()),
+        "nodes": float(np.mean(size > LARGE)),
+    }
+    if len(state.seed) and len(outside := _outside_first_ring(state)):
+        report.max_displacement_outside_first_ring_mm = 1e3 * float(np.linalg.norm(outside, axis=1).max())
+
+
+def _outside_first_ring(state: FinalState) -> _Floats:
+    """Displacements (n, 3), m, at the nodes and integration points of no cell that has a node of the tumour."""
+    model = state.model
+    on_seed = np.zeros(model.n_nodes, bool)
+    on_seed[state.seed] = True
+    ring_domains = on_seed[model.domains].any(axis=1)
+    outside = np.ones(model.n_nodes, bool)
+    outside[model.domains[ring_domains]] = False
+    outside[model.hexahedra[on_seed[model.hexahedra].any(axis=1)]] = False
+    return np.concatenate([state.field[outside], state.domain_displacement[~ring_domains]])
+
+
+def _cloud(report: Report, state: FinalState) -> None:
+    """Residuals of moving least squares at the EFG nodes.
+
+    Where they are large the polynomials cannot follow the field. In 14 grown spheres the error of the field was 0.8 to
+    3.8 times the residual.
+    """
+    misfit = np.linalg.norm((state.field - state.displacement)[state.model.n_fe_nodes :], axis=1)
+    if len(misfit):
+        report.cloud_misfit_mm = 1e3 * float(misfit.max())
+        report.cloud_misfit_of_90_percent_mm = 1e3 * float(np.quantile(misfit, 0.9))
+
+
+def _ventricles(report: Report, state: FinalState) -> None:
+    """Volumes of the ventricles, their changes (negative if they shrink), and displacements of their walls."""
+    model, undeformed = state.model, state.hexahedron_volumes
+    before, change, wall = {}, {}, {}
+    for side, cells in state.ventricles.items():
+        after = hexahedra.volumes(model.points + state.field, model.hexahedra[cells])
+        before[side] = 1e6 * float(undeformed[cells].sum())
+        change[side] = 1e6 * float((after - undeformed[cells]).sum())
+        on_wall = np.unique(boundary_faces(model.hexahedra[cells]))
+        wall[side] = 1e3 * float(np.linalg.norm(state.field[on_wall], axis=1).max())
+    if before:
+        report.ventricle_volume_ml = before | {"total": sum(before.values())}
+        report.ventricle_volume_change_ml = change | {"total": sum(change.values())}
+        report.max_displacement_of_ventricle_wall_mm = wall
+        report.midline_shift_mm = _midline_shift(state)
+
+
+def _midline_shift(state: FinalState) -> float | None:
+    """Largest displacement across the midline of the tissue between the ventricles, mm; positive to the right.
+
+    The midline's plane is half-way between the centres of the ventricles and normal to the line through them. The nodes
+    within half a hexahedron of this plane count that lie within the ventricles' extent along the plane. None without
+    two ventricles.
+    """
+    model, sides = state.model, state.ventricles
+    if len(sides) < 2:
+        return None
+    nodes = [np.unique(model.hexahedra[cells]) for cells in sides.values()]
+    left, right = (model.points[of].mean(axis=0) for of in nodes)
+    across = (right - left) / np.linalg.norm(right - left)
+    from_plane = model.points @ across - (left + right) @ across / 2
+    projected = model.points - np.outer(model.points @ across, across)
+    both = projected[np.concatenate(nodes)]
+    between = ((projected >= both.min(axis=0)) & (projected <= both.max(axis=0))).all(axis=1)
+    near = np.abs(from_plane) <= float(np.cbrt(state.hexahedron_volumes.mean())) / 2
+    shifts = (state.field @ across)[between & near]
+    return 1e3 * float(shifts[np.abs(shifts).argmax()]) if len(shifts) else None
+
+
+def _jacobians(report: Report, state: FinalState) -> None:
+    """The smallest J in the last frame and its cell, and the volume of cells with a low J."""
+    cell, low = int(np.argmin(state.jacobian)), state.jacobian < LOW_JACOBIAN
+    report.smallest_jacobian = LowestJacobian(
+        now=float(state.jacobian[cell]),
+        cell=state.cell_kind(cell),
+        material=state.model.materials[state.model.material[cell]].name,
+        place_mm=(1e3 * state.cell_centre(cell)).tolist(),
+    )
+    report.low_jacobian_cells = int(low.sum())
+    report.low_jacobian_mm3 = 1e9 * float(state.volumes[low].sum())
+
+
+def _tumour(report: Report, state: FinalState) -> None:
+    """Volume of the tumour by its nodes and by the field at them, and the balance of the added volume.
+
+    The volume is that of the sphere of which the nodes are a sample, (4 pi / 3) mean r^3: the hull of the nodes lacks
+    the caps between them. Its integral of r^3 over the solid angle also holds for the uneven surface of the field.
+    """
+    model, seed, centre = state.model, state.seed, state.centre
+    if centre is None or not len(seed):
+        return
+
+    def volume(displacement: _Floats) -> float:
+        cubes = np.linalg.norm(model.points[seed] + displacement[seed] - centre, axis=1) ** 3
+        return 4 / 3 * math.pi * float(cubes.mean())
+
+    reached = volume(state.displacement)
+    report.tumour_volume_mm3 = 1e9 * reached
+    report.tumour_volume_by_field_mm3 = 1e9 * volume(state.field)
+    interface = model.node_sets.get("interface", np.empty(0, np.int64))
+    faces = interface_faces(model.points, model.hexahedra, interface, model.domain_points)
+    if len(faces) and not np.any(state.field[_open_edge_nodes(faces)]):
+        added = reached - 4 / 3 * math.pi * state.metadata["tumour"]["seed_radius_m"] ** 3
+        pushed = enclosed_volume(model.points, faces) - enclosed_volume(model.points + state.field, faces)
+        compressed = float((model.domain_volumes * (1 - state.jacobian[model.cells_of("support domains")])).sum())
+        report.volume_added_mm3 = 1e9 * added
+        report.volume_pushed_mm3 = 1e9 * pushed
+        report.volume_compressed_mm3 = 1e9 * compressed
+        report.volume_error = abs(added - pushed - compressed) / added if added > 0 else math.nan
+
+
+def enclosed_volume(points: _Floats, faces: NDArray[np.int64]) -> float:
     """Volume (m^3) inside a closed surface of bilinear faces (n, 4), anticlockwise seen from outside; exact.
 
-    (1/3) of the integral of x . n: the faces of trilinear hexahedra are such, so that volumes add up to round-off.
+    It is (1/3) of the integral of x . n. The faces of trilinear hexahedra are bilinear, so volumes add up to round-off.
     """
     a, b, c, d = np.moveaxis(points[faces], 1, 0)
     total = 0.0
@@ -274,217 +272,75 @@ def enclosed_volume(points: NDArray[np.float64], faces: NDArray[np.int64]) -> fl
     return total
 
 
-def _outside_first_ring(outcome: Outcome) -> NDArray[np.float64]:
-    """Displacements (n, 3), m, at nodes and integration points that no cell with a node of the tumour has."""
-    model = outcome.model
-    on_seed = np.zeros(model.n_nodes, bool)
-    on_seed[outcome.seed] = True
-    ring_domains = on_seed[model.domains].any(axis=1)
-    outside = np.ones(model.n_nodes, bool)
-    outside[model.domains[ring_domains]] = False
-    outside[model.hexahedra[on_seed[model.hexahedra].any(axis=1)]] = False
-    return np.concatenate([outcome.field[outside], outcome.domain_displacement[~ring_domains]])
-
-
-def _ventricles(outcome: Outcome, fe_volumes: NDArray[np.float64]) -> dict[str, Any]:
-    """Volumes of the ventricles' hexahedra, their change (negative: they shrink), and how far their walls moved."""
-    model = outcome.model
-    before, change, wall = {}, {}, {}
-    for side, cells in _in_ventricles(model).items():
-        after = hexahedra.volumes(model.points + outcome.field, model.hexahedra[cells])
-        before[side] = 1e6 * float(fe_volumes[cells].sum())
-        change[side] = 1e6 * float((after - fe_volumes[cells]).sum())
-        on_wall = np.unique(boundary_faces(model.hexahedra[cells]))
-        wall[side] = 1e3 * float(np.linalg.norm(outcome.field[on_wall], axis=1).max())
-    if not before:
-        return {}
-    return {
-        "ventricle_volume_ml": before | {"total": sum(before.values())},
-        "ventricle_volume_change_ml": change | {"total": sum(change.values())},
-        "max_displacement_of_ventricle_wall_mm": wall,
-        **({"midline_shift_mm": shift} if (shift := _midline_shift(outcome, fe_volumes)) is not None else {}),
-    }
-
-
-def _in_ventricles(model: Model) -> dict[str, NDArray[np.int64]]:
-    """Hexahedra of each ventricle that there is, left first."""
-    sets = {side: model.cell_sets.get(name, np.empty(0, np.int64)) for side, name in VENTRICLES.items()}
-    found = {side: model.rows_of("hexahedra", cells) for side, cells in sets.items()}
-    return {side: cells for side, cells in found.items() if len(cells)}
-
-
-def _midline_shift(outcome: Outcome, fe_volumes: NDArray[np.float64]) -> float | None:
-    """How far what lies between the ventricles moves across the midline, mm: the largest, above 0 to the right.
-
-    The midline's plane halves the way between the ventricles' middles and is normal to it. Of the nodes within half a
-    hexahedron of it those count that lie as far front and back, up and down as the ventricles do. None without two.
-    """
-    model = outcome.model
-    sides = _in_ventricles(model)
-    if len(sides) < 2:
-        return None
-    nodes = [np.unique(model.hexahedra[cells]) for cells in sides.values()]
-    left, right = (model.points[of].mean(axis=0) for of in nodes)
-    across = (right - left) / np.linalg.norm(right - left)
-    from_plane = model.points @ across - (left + right) @ across / 2
-    # Where they lie, seen along the way across.
-    flat = model.points - np.outer(model.points @ across, across)
-    both = flat[np.concatenate(nodes)]
-    between = ((flat >= both.min(axis=0)) & (flat <= both.max(axis=0))).all(axis=1)
-    near = np.abs(from_plane) <= float(np.cbrt(fe_volumes.mean())) / 2
-    shifts = (outcome.field @ across)[between & near]
-    return 1e3 * float(shifts[np.abs(shifts).argmax()]) if len(shifts) else None
-
-
-def _smallest(outcome: Outcome, volumes: NDArray[np.float64]) -> dict[str, Any]:
-    """Where J is smallest in the last frame, and how much of the body is in cells that lost much of their volume."""
-    model, jacobian = outcome.model, outcome.jacobian
-    cell = int(np.argmin(jacobian))
-    block, row = model.find_cell(cell)
-    place = block.columns["points"][row] if block.kind.meshfree else model.points[block.nodes[row]].mean(axis=0)
-    crushed = jacobian < CRUSHED
-    return {
-        "smallest_jacobian": {
-            "now": float(jacobian[cell]),
-            "cell": block.kind.singular,
-            "material": model.materials[model.material[cell]].name,
-            "place_mm": (1e3 * place).tolist(),
-        },
-        "crushed": {"cells": int(crushed.sum()), "volume_mm3": 1e9 * float(volumes[crushed].sum())},
-    }
-
-
-def _tumour(outcome: Outcome, centre: NDArray[np.float64]) -> dict[str, Any]:
-    """Volume of the tumour as reached, by its nodes and by the field there, and where the added volume went.
-
-    The volume is that of the sphere of which the nodes are a sample, (4 pi / 3) mean r^3: their hull would be short of
-    it by the caps between them. Its integral of r^3 over the solid angle holds for the field's bumpy surface as well.
-    """
-    model, seed = outcome.model, outcome.seed
-
-    def volume(displacement: NDArray[np.float64]) -> float:
-        cubes = np.linalg.norm(model.points[seed] + displacement[seed] - centre, axis=1) ** 3
-        return 4 / 3 * math.pi * float(cubes.mean())
-
-    reached = volume(outcome.displacement)
-    report: dict[str, Any] = {
-        "tumour_volume_mm3": 1e9 * reached,
-        "tumour_volume_by_field_mm3": 1e9 * volume(outcome.field),
-    }
-    interface = model.node_sets.get("interface", np.empty(0, np.int64))
-    faces = interface_faces(model.points, model.hexahedra, interface, model.domain_points)
-    if len(faces) and not np.any(outcome.field[_rim(faces)]):
-        added = reached - 4 / 3 * math.pi * outcome.metadata["tumour"]["seed_radius_m"] ** 3
-        pushed = enclosed_volume(model.points, faces) - enclosed_volume(model.points + outcome.field, faces)
-        compressed = float((model.domain_volumes * (1 - outcome.jacobian[model.cells_of("support domains")])).sum())
-        report["volume_balance"] = {
-            "tumour_added_mm3": 1e9 * added,
-            "pushed_through_interface_mm3": 1e9 * pushed,
-            "elastic_compression_mm3": 1e9 * compressed,
-            "relative_error": abs(added - pushed - compressed) / added if added > 0 else math.nan,
-        }
-    return report
-
-
-def _rim(faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Nodes where a surface of faces (n, 4) ends: edges that no other face runs along the other way."""
+def _open_edge_nodes(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Nodes where a surface of faces (n, 4) ends: on edges that no other face has in the opposite direction."""
     edges = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
     base = int(faces.max()) + 1
     forth, back = edges[:, 0] * base + edges[:, 1], edges[:, 1] * base + edges[:, 0]
     return np.unique(edges[~np.isin(forth, back)])
 
 
-def _draw(outcome: Outcome, directory: Path) -> list[str] | str:
-    """Names of the pictures drawn, or why there are none."""
-    if not outcome.metadata.get("deck", {}).get("output", {}).get("pictures", True):
-        return "none, for output.pictures is false"
-    try:
-        import matplotlib  # noqa: F401  (optional: only the pictures need it)
-    except ImportError:
-        return "none, for matplotlib is missing; install it: pip install 'mpitled[pictures]'"
-    from mpitled.results import plot
-
-    try:
-        return plot.draw(directory, outcome.solid, outcome.centre, outcome.title)
-    except OSError as error:
-        return f"none, for they cannot be written ({error.strerror})"
+# --- warnings ------------------------------------------------------------------------------------------------------
 
 
-def _without_nan(value: Any) -> Any:
-    """The same with None for numbers that JSON does not have."""
-    if isinstance(value, Mapping):
-        return {name: _without_nan(inner) for name, inner in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _warnings(report: Report, model: Model) -> Iterator[str]:
+    """Reasons why a result may be wrong, each with its remedy."""
+    yield from _artificial_energy(report, model)
+    yield from _volume_warnings(report)
+    if report.cloud_misfit_mm is not None and _is_over("cloud_misfit_mm", report.cloud_misfit_mm):
+        # Next to a grown seed the spacing on its surface decides, and a finer cloud behind it changes little.
+        grown = report.volume_error is not None
+        remedy = "raise tumour.surface_nodes: four times as many halve it" if grown else "lower cloud.spacing"
+        yield (
+            "the cloud is too coarse for its field: the residual of moving least squares is "
+            f"{report.cloud_misfit_mm:.2g} mm at the worst node, and up to "
+            f"{report.cloud_misfit_of_90_percent_mm:.2g} mm at 90 % of the nodes; refine the cloud there ({remedy})"
+        )
+    yield from _static_distance(report)
 
 
-# --- the table -----------------------------------------------------------------------------------------------------
-
-#: Key, name and format of each line of the table; parts of a key are listed as they are. With `_HEADLINES`, which are
-#: what was asked for and how far it can be trusted, a run ends; the others are for who looks closer.
-_LINES = (
-    ("max_displacement_mm", "largest displacement", "{:.2f} mm"),
-    ("max_displacement_outside_first_ring_mm", "outside the tumour's first ring of cells", "{:.2f} mm"),
-    ("max_displacement_of_ventricle_wall_mm", "largest, ventricle walls", "{:.2f} mm"),
-    ("share_over_5mm", "moved more than 5 mm", "{:.2%}"),
-    ("midline_shift_mm", "shift of the midline between the ventricles", "{:+.2f} mm (+: to the right)"),
-    ("ventricle_volume_ml", "ventricles, undeformed", "{:.3f} ml"),
-    ("ventricle_volume_change_ml", "ventricles, change", "{:+.3f} ml"),
-    ("tumour_volume_mm3", "tumour as reached", "{:.1f} mm3"),
-    ("tumour_volume_by_field_mm3", "tumour by the field at its nodes", "{:.1f} mm3"),
-    ("volume_balance.tumour_added_mm3", "volume added by the tumour", "{:.1f} mm3"),
-    ("volume_balance.pushed_through_interface_mm3", "pushed through the interface", "{:.1f} mm3"),
-    ("volume_balance.elastic_compression_mm3", "compression of the cloud", "{:.1f} mm3"),
-    ("volume_balance.relative_error", "volume balance, error", "{:.2%}"),
-    ("cloud_misfit_mm", "uncertainty of the cloud, worst node", "{:.3f} mm"),
-    ("static_distance_mm", "from the static solution, by its own estimate", "{:.2g} mm"),
-    ("min_jacobian", "smallest J, a cell's volume over undeformed", "{:.4f}"),
-    ("crushed.volume_mm3", "in cells below J = 0.5", "{:.3g} mm3"),
-    ("energy_J.external", "external work", "{:.4g} J"),
-    ("energy_J.internal", "internal energy", "{:.4g} J"),
-    ("energy_J.kinetic", "kinetic energy", "{:.4g} J"),
-    ("energy_J.added_mass", "energy of added mass", "{:.4g} J"),
-    ("energy_J.dissipated", "taken by damping, less what changed masses gave", "{:.4g} J"),
-    ("energy_J.balance_error", "energy balance, error", "{:.2%}"),
-    ("kinetic_to_internal.largest_after_10_percent", "kinetic/internal, largest after 10 %", "{:.2%}"),
-    ("kinetic_to_internal.at_end", "kinetic/internal, at the end", "{:.2%}"),
-    ("nodes", "nodes", "{:,}"),
-    ("cells", "cells", "{:,}"),
-    ("ranks", "ranks", "{}"),
-    ("steps", "steps", "{:,}"),
-    ("time_step_s", "time step", "{:.3g} s"),
-    ("cell_updates_per_second", "cell updates a second", "{:.3g}"),
-    ("halo_share", "halo's share of the loop, worst rank", "{:.1%}"),
-    ("imbalance", "imbalance of computing", "{:.1%}"),
-    ("run_s", "run time", "{:.1f} s"),
-    ("seconds", "run time, by phase", "{:.1f} s"),
-)
-_HEADLINES = {
-    "max_displacement_mm", "max_displacement_of_ventricle_wall_mm", "midline_shift_mm", "ventricle_volume_change_ml",
-    "tumour_volume_mm3", "volume_balance.relative_error", "cloud_misfit_mm", "static_distance_mm", "min_jacobian",
-    "crushed.volume_mm3", "steps", "run_s",
-}  # fmt: skip
-#: Lines of relaxation alone, and those that mean nothing there, where masses and time are fictitious.
-_OF_RELAXATION = {"energy_J.dissipated"}
-_OF_MARCHES = {"energy_J.added_mass", "kinetic_to_internal.largest_after_10_percent", "time_step_s"}
+def _is_over(key: str, value: float) -> bool:
+    limit = BY_KEY[key].limit
+    return limit is not None and value > limit
 
 
-def rows(report: Mapping[str, Any], *, whole: bool = True) -> Iterator[tuple[str, str]]:
-    """Name and value of each line of the table, or of its headlines."""
-    if "loop" in report["seconds"]:  # of a run that was killed nothing is known but how long its report took
-        report = dict(report) | {"run_s": sum(report["seconds"].values())}
-    foreign = _OF_MARCHES if report.get("method") == "dynamic-relaxation" else _OF_RELAXATION
-    for key, name, form in _LINES:
-        if key in foreign or not (whole or key in _HEADLINES):
-            continue
-        value: Any = report
-        for part in key.split("."):
-            value = value.get(part) if isinstance(value, Mapping) else None
-        if isinstance(value, Mapping):
-            parts = (f"{form.format(v)} {k.replace('_', ' ')}" for k, v in value.items() if v is not None)
-            yield name, ", ".join(parts)
-        elif value is not None:
-            yield name, form.format(value)
-    if whole and "peak_memory_bytes" in report:
-        yield "peak memory of each rank", ", ".join(f"{b / 2**20:.0f} MiB" for b in report["peak_memory_bytes"])
+def _artificial_energy(report: Report, model: Model) -> Iterator[str]:
+    energy = report.energy_J or {}
+    if energy.get("internal", 0) <= 0:
+        return
+    share = (energy["hourglass"] + energy["stabilisation"]) / energy["internal"]
+    if share > MAX_ARTIFICIAL_ENERGY:
+        # The stiffness of these modes is a share of lambda + 2 mu, which is unbounded towards a ratio of 0.5.
+        stiff = max(material.poissons_ratio for material in model.materials) > NEARLY_INCOMPRESSIBLE
+        remedy = "lower material.NAME.poissons_ratio (0.49)" if stiff else "raise support.stabilisation"
+        yield (
+            f"{share:.0%} of the internal energy is in modes without strain at the integration points, so the "
+            f"displacements are not to be trusted: refine the mesh or the cloud, or {remedy}"
+        )
+
+
+def _volume_warnings(report: Report) -> Iterator[str]:
+    error = report.volume_error
+    if error is not None and _is_over("volume_balance.relative_error", error):
+        wrong = (
+            "of the grown volume is lost"
+            if report.volume_unaccounted_mm3 > 0
+            else "more volume is displaced than was grown"
+        )
+        yield f"{error:.0%} {wrong}: refine the cloud around the tumour (cloud.growth)"
+    low, tumour = report.low_jacobian_mm3 or 0.0, report.tumour_volume_mm3 or math.inf
+    if low > MAX_LOW_JACOBIAN_VOLUME * tumour:
+        yield (
+            f"{low:.3g} mm3 of tissue, {low / tumour:.1%} of the tumour's volume, is in cells that lost more than half "
+            "of their volume: beside the tumour the field is not to be trusted; refine the cloud there (cloud.growth)"
+        )
+
+
+def _static_distance(report: Report) -> Iterator[str]:
+    slower = 'load more slowly (solver.load_time), or set solver.method = "dynamic-relaxation"'
+    distance = report.static_distance_mm
+    if distance is not None and _is_over("static_distance_mm", distance):
+        remedy = "lower solver.tolerance" if report.method == RELAXATION else slower
+        yield f"the run ended {distance:.2g} mm from the static solution: {remedy}"
+    elif report.method == "quasi-static" and distance is None:
+        yield f"the distance of the end of the ramp from the static solution could not be estimated: {slower}"

@@ -1,7 +1,6 @@
-"""3-D views of a body before and after: by PyVista where it works, else by matplotlib; and a window to turn it in.
+"""Views of a body in three dimensions, before and after, by PyVista; and a window to turn the body in.
 
-The only importer of PyVista. Where VTK finds no way to draw it may end the whole process, so that its pictures are made
-in a process of their own.
+VTK may end the whole process if it cannot render. The pictures are therefore drawn in a process of their own.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import ctypes.util
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,160 +19,82 @@ from numpy.typing import NDArray
 
 from mpitled import store
 from mpitled.errors import InputError
-from mpitled.results import report
-from mpitled.results.solid import Solid, displaced
+from mpitled.results import final_state
+from mpitled.results.final_state import FinalState
 
-#: Of parts, told apart by the colour-blind (Okabe and Ito 2008), and the map of displacements, as in the cuts.
+#: Colours of parts, distinct to the colour-blind (Okabe and Ito 2008).
 COLOURS = {"tumour": "#d55e00", "left ventricle": "#0072b2", "right ventricle": "#56b4e9", "body": "#d9d4cc"}
-MAP = "magma_r"
-#: Moves all alike, and so far that it would be black.
+#: The tumour's surface moves uniformly, and so far that the map of displacements would show it black.
 _PLAIN = {"tumour"}
-_THIN = 0.4  # opacity of the body around the parts
-_SCALARS = "displacement (mm)"
-_LONGEST = 120  # s that PyVista may take for the pictures
+_OPACITY = 0.4  # of the body around the parts
+_TIMEOUT = 120  # s for the pictures
 _PIXELS = 900  # width of a panel
-_NO_PYVISTA = 5  # exit status
-_INSTALL = "PyVista is missing; install it: pip install 'mpitled[python]'"
-
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """Where the body is looked at from, in parallel projection, and what is seen of it; mm."""
-
-    title: str
-    labels: tuple[str, str]  # of the axes that run right and up
-    right: NDArray[np.float64]  # (3,), unit vector
-    up: NDArray[np.float64]  # (3,), unit vector
-    low: NDArray[np.float64]  # (2,), limits of the picture, right and up
-    high: NDArray[np.float64]
-
-    @property
-    def towards(self) -> NDArray[np.float64]:
-        """(3,), unit vector towards the viewer."""
-        return np.cross(self.right, self.up)
-
-    def flat(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points (..., 3) as (..., 2) in the picture."""
-        return points @ np.stack([self.right, self.up], axis=1)
-
-
-def parts(solid: Solid) -> dict[str, NDArray[np.int64]]:
-    """Triangles (n, 3) by name: ventricles and tumour, or if there is neither the body."""
-    found = {name.replace("_", " "): wall for name, wall in solid.walls.items()}
-    if len(solid.tumour):
-        found["tumour"] = solid.tumour
-    return found or {"body": solid.surface}
-
-
-def views(solid: Solid, centre: NDArray[np.float64] | None) -> list[View]:
-    """At an angle, from the side of the tumour whose centre (3,), m, is given, and from above."""
-    places = np.concatenate([solid.points, solid.points + solid.displacement])
-    side = -1.0 if centre is not None and 1e3 * centre[0] < solid.points[:, 0].mean() else 1.0
-    right = np.array([1.0, 0.8 * side, 0.0]) / np.hypot(1.0, 0.8)
-    back = np.cross(np.array([0.0, 0.0, 1.0]), right)  # away from the viewer, level
-    up = np.cos(0.35) * np.array([0.0, 0.0, 1.0]) + np.sin(0.35) * back
-    made = []
-    for title, labels, across, upwards in (
-        ("at an angle", ("across (mm)", "up (mm)"), right, up),
-        ("from above", ("x (mm)", "y (mm)"), np.eye(3)[0], np.eye(3)[1]),
-    ):
-        flat = places @ np.stack([across, upwards], axis=1)
-        margin = 0.05 * np.ptp(flat, axis=0).max()
-        made.append(View(title, labels, across, upwards, flat.min(axis=0) - margin, flat.max(axis=0) + margin))
-    return made
+_LIGHT = {"ambient": 0.4, "diffuse": 0.6, "show_scalar_bar": False}
+_INSTALL = "PyVista is missing; install it: pip install 'mpitled[pictures]'"
 
 
 def draw(directory: Path, path: Path) -> str:
-    """Write a picture of the last frame of the run in a directory, before and after; what drew it, in words."""
+    """Write a picture of the last frame of the run in a directory, before and after; "", or why there is none."""
     command = [sys.executable, "-c", "from mpitled.results.views import main; main()", str(directory), str(path)]
-    why = "PyVista found no way to draw here"
     try:
-        done = subprocess.run(command, capture_output=True, timeout=_LONGEST, check=False)
-        if done.returncode == 0:
-            return "PyVista"
-        if done.returncode == _NO_PYVISTA:
-            why = _INSTALL
+        done = subprocess.run(command, capture_output=True, timeout=_TIMEOUT, check=False)
     except subprocess.TimeoutExpired:
-        why = f"PyVista took longer than {_LONGEST} s"
-    _draw(directory, path, _painter)
-    return f"matplotlib ({why})"
+        return f"PyVista took longer than {_TIMEOUT} s"
+    return "" if done.returncode == 0 else "PyVista cannot render on this machine"
 
 
 def main() -> None:
-    """In a process of its own: the picture of sys.argv[1] into sys.argv[2] by PyVista."""
-    try:
-        pyvista()
-    except InputError:
-        sys.exit(_NO_PYVISTA)
-    _draw(Path(sys.argv[1]), Path(sys.argv[2]), _renderer)
+    """Draw the run sys.argv[1] into the picture sys.argv[2], in a process of its own."""
+    import pyvista
 
-
-def pyvista() -> Any:
-    """The library. InputError if it is missing."""
-    try:
-        import pyvista as library
-    except ImportError:
-        raise InputError(_INSTALL) from None
-    return library
-
-
-def grid(result: store.Result, frame: int) -> Any:
-    """A frame as pyvista.UnstructuredGrid: see `mpitled.interface.RunResult.to_pyvista`. InputError without PyVista."""
-    library, hexahedra = pyvista(), result.hexahedra
-    numbers = result.point_data("node_id")
-    rest = np.setdiff1d(np.arange(len(numbers)), hexahedra)
-    cells = {library.CellType.HEXAHEDRON: hexahedra, library.CellType.VERTEX: rest[:, None]}
-    made = library.UnstructuredGrid({kind: nodes for kind, nodes in cells.items() if len(nodes)}, result.points)
-    made.point_data["displacement"] = result.point_data("displacement", frame)
-    of_frames = ((name, result.cell_data(name, frame), np.nan) for name in result.names("Cell"))
-    for name, values, none in (
-        *of_frames,
-        ("material", result.cell_data("material"), -1),
-        ("kind", result.cell_data("kind"), store.EFG_NODE),
-    ):
-        # Of integration points, which are the last cells, in order.
-        at_rows = np.full((len(numbers), *values.shape[1:]), none, values.dtype)
-        at_rows[numbers < 0] = values[len(values) - np.count_nonzero(numbers < 0) :]
-        made.cell_data[name] = np.concatenate([values[: len(hexahedra)], at_rows[rest]])
-    return made
+    pyvista.vtk_verbosity("off")  # VTK complains of missing screens before it falls back
+    figure(final_state.read(Path(sys.argv[1]))).savefig(sys.argv[2], dpi=110)
 
 
 def show(path: Path) -> None:
-    """Open a window with the frames of the run at a path, to turn and to slide through; back when it is closed.
+    """Open a window with the frames of the run at a path, to turn and to slide through; return when it is closed.
 
     InputError if there is no result, no PyVista or no screen.
     """
     with store.open_result(path) as result:
         directory = result.path.parent
-    outcome = report.read(directory)
+    state = final_state.read(directory)
     if not _has_screen():
         raise InputError(
-            f"{path}: there is no screen here to show it on (DISPLAY is not set, or nobody answers); mpitled report "
-            f"{directory} --html makes a page of pictures"
+            f"{path}: there is no screen to show it on (DISPLAY is not set, or no X server answers); mpitled report "
+            f"{directory} --html writes a page with pictures"
         )
-    plotter = pyvista().Plotter(title=f"mpitled: {outcome.title}")
-    with store.open_result(directory) as result:
-        solid = outcome.solid
-        times, n = result.times, result.n_frames
-        largest = float(_norm(solid).vmax)
+    try:
+        import pyvista
+    except ImportError:
+        raise InputError(_INSTALL) from None
+    from mpitled.results import solid as meshes
 
-        def place(value: float) -> None:
+    solid = meshes.solid_of(state)
+    largest = _largest(solid)
+    plotter: Any = pyvista.Plotter(title=f"mpitled: {state.title}")
+    with store.open_result(directory) as result:
+        times, n = result.times, result.n_frames
+
+        def show_frame(value: float) -> None:
             frame = round(value)
-            field, displacement = (result.at_nodes(name, frame) for name in ("displacement", "parameters"))
-            moved = replace(outcome, field=field, displacement=displacement).moved
-            _add(plotter, displaced(solid, moved), 1.0, largest)
+            field, parameters = (result.at_nodes(name, frame) for name in ("displacement", "parameters"))
+            displacement = 1e3 * replace(state, field=field, displacement=parameters).shown_displacement
+            for mesh in (solid.surface, *_parts(solid).values()):
+                meshes.with_displacement(mesh, displacement)
+            _add_meshes(plotter, solid, 1.0, largest)
             plotter.add_text(f"time {times[frame]:.4g}", name="time", font_size=10)
 
-        place(n - 1)
+        show_frame(n - 1)
         if n > 1:
-            plotter.add_slider_widget(place, (0, n - 1), value=n - 1, title="frame", fmt="%.0f")
-        plotter.add_scalar_bar(_SCALARS)
+            plotter.add_slider_widget(show_frame, (0, n - 1), value=n - 1, title="frame", fmt="%.0f")
+        plotter.add_scalar_bar(meshes.SIZE)
         plotter.add_axes()
         plotter.show()
 
 
 def _has_screen() -> bool:
-    """Whether a window can open: VTK ends in silence where an X server is wanted and none answers."""
+    """Whether a window can open: VTK ends the process silently if it needs an X server and none answers."""
     if sys.platform != "linux":
         return True
     library = ctypes.util.find_library("X11")
@@ -185,137 +105,126 @@ def _has_screen() -> bool:
     return connect(None) is not None
 
 
-_Paint = Callable[[Any, View, float], None]  # of matplotlib's axes, with a share of the displacement
+# --- pictures ------------------------------------------------------------------------------------------------------
 
 
-def _draw(directory: Path, path: Path, painter: Callable[[Solid], _Paint]) -> None:
-    """A row for each view, before and after, with what the colours mean."""
+@dataclass(frozen=True, slots=True)
+class _View:
+    """A direction of view in parallel projection, and the limits of the picture; mm."""
+
+    title: str
+    labels: tuple[str, str]  # of the axes that run right and up
+    axes: NDArray[np.float64]  # (2, 3), unit vectors to the right and up
+    low: NDArray[np.float64]  # (2,)
+    high: NDArray[np.float64]  # (2,)
+
+
+def _views(state: FinalState, solid: Any) -> list[_View]:
+    """At an angle, from the side of the tumour, and from above."""
+    points = np.concatenate([solid.points, solid.points + solid.displacement])
+    side = -1.0 if state.centre is not None and 1e3 * state.centre[0] < solid.points[:, 0].mean() else 1.0
+    right = np.array([1.0, 0.8 * side, 0.0]) / np.hypot(1.0, 0.8)
+    back = np.cross([0.0, 0.0, 1.0], right)  # horizontal, away from the viewer
+    up = np.cos(0.35) * np.array([0.0, 0.0, 1.0]) + np.sin(0.35) * back
+    made = []
+    for title, labels, axes in (
+        ("at an angle", ("across (mm)", "up (mm)"), np.stack([right, up])),
+        ("from above", ("x (mm)", "y (mm)"), np.eye(3)[:2]),
+    ):
+        flat = points @ axes.T
+        margin = 0.05 * np.ptp(flat, axis=0).max()
+        made.append(_View(title, labels, axes, flat.min(axis=0) - margin, flat.max(axis=0) + margin))
+    return made
+
+
+def part_names(state: FinalState) -> list[str]:
+    """Names of the parts that are shown: ventricles and tumour, or the body if there is neither."""
+    tumour = ["tumour"] if len(state.seed) else []
+    return [*(f"{side} ventricle" for side in state.ventricles), *tumour] or ["body"]
+
+
+def _parts(solid: Any) -> dict[str, Any]:
+    """The meshes of the parts that are shown, by their names."""
+    found = {f"{side} ventricle": wall for side, wall in solid.walls.items()}
+    return found | ({"tumour": solid.tumour} if solid.tumour.n_cells else {}) or {"body": solid.surface}
+
+
+def _largest(solid: Any) -> float:
+    """Largest displacement (mm) of the parts that are coloured by it."""
+    from mpitled.results.solid import SIZE
+
+    coloured = [mesh for name, mesh in _parts(solid).items() if name not in _PLAIN]
+    nodes = [mesh.point_data[SIZE][mesh.regular_faces.ravel()].max() for mesh in coloured]
+    return float(max(nodes, default=0.0)) or 1.0
+
+
+def figure(state: FinalState) -> Any:
+    """A matplotlib Figure with a row for each view, before and after, and a legend."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    from mpitled.results.plot import name_sides
+    from mpitled.results.cuts import MAP, name_sides
+    from mpitled.results.solid import SIZE, solid_of
 
-    outcome = report.read(directory)
-    solid = outcome.solid
-    paint, chosen = painter(solid), views(solid, outcome.centre)
-    shapes = [view.high - view.low for view in chosen]
-    heights = [up / right for right, up in shapes]
-    figure = Figure(figsize=(13.0, 5.6 * sum(heights) + 1.2), layout="constrained")
-    FigureCanvasAgg(figure)
-    panels = figure.subplots(len(chosen), 2, height_ratios=heights)
+    solid = solid_of(state)
+    chosen, names, largest = _views(state, solid), part_names(state), _largest(solid)
+    extents = [view.high - view.low for view in chosen]
+    heights = [up / right for right, up in extents]
+    made = Figure(figsize=(13.0, 5.6 * sum(heights) + 1.2), layout="constrained")
+    FigureCanvasAgg(made)
+    panels = made.subplots(len(chosen), 2, height_ratios=heights)
     for row, view in zip(panels, chosen, strict=True):
         for axes, (when, share) in zip(row, (("before", 0.0), ("after", 1.0)), strict=True):
-            paint(axes, view, share)
-            axes.set(
-                title=f"{when}, {view.title}", xlabel=view.labels[0], ylabel=view.labels[1], aspect="equal",
-                xlim=(view.low[0], view.high[0]), ylim=(view.low[1], view.high[1]),
-            )  # fmt: skip
+            extent = (view.low[0], view.high[0], view.low[1], view.high[1])
+            axes.imshow(_render(solid, view, share, largest), extent=extent)
+            axes.set(title=f"{when}, {view.title}", xlabel=view.labels[0], ylabel=view.labels[1])
             if 0 in solid.sides:
                 name_sides(axes, solid.sides[0])
-    if parts(solid).keys() - _PLAIN:
-        figure.colorbar(
-            ScalarMappable(_norm(solid), MAP), ax=panels[:, 1], label="after: displacement (mm)", shrink=0.6, pad=0.02
-        )
-    shown = [
-        Patch(facecolor=COLOURS[name], label=name if name in _PLAIN else f"before: {name}") for name in parts(solid)
-    ]
-    if "body" not in parts(solid):
-        shown.append(
-            Patch(facecolor=COLOURS["body"], alpha=_THIN, label="before and after: surface of the body behind them")
-        )
-    figure.legend(handles=shown, loc="outside lower center", ncols=len(shown), frameon=False)
-    figure.savefig(path, dpi=110)
+    if set(names) - _PLAIN:
+        mappable = ScalarMappable(Normalize(0.0, largest), MAP)
+        made.colorbar(mappable, ax=panels[:, 1], label=f"after: {SIZE}", shrink=0.6, pad=0.02)
+    legend = [Patch(facecolor=COLOURS[name], label=name if name in _PLAIN else f"before: {name}") for name in names]
+    if "body" not in names:
+        around = "before and after: surface of the body behind them"
+        legend.append(Patch(facecolor=COLOURS["body"], alpha=_OPACITY, label=around))
+    made.legend(handles=legend, loc="outside lower center", ncols=len(legend), frameon=False)
+    return made
 
 
-def _norm(solid: Solid) -> Any:
-    """Of the displacements (mm) of what is coloured by them."""
-    from matplotlib.colors import Normalize
+def _render(solid: Any, view: _View, share: float, largest: float) -> NDArray[np.uint8]:
+    """The picture (height, width, 3) of a view of the body with a share of its displacements."""
+    import pyvista
 
-    coloured = [triangles.ravel() for name, triangles in parts(solid).items() if name not in _PLAIN]
-    shown = np.concatenate(coloured) if coloured else slice(None)
-    return Normalize(0.0, float(np.linalg.norm(solid.displacement[shown], axis=1).max()) or 1.0)
-
-
-def _renderer(solid: Solid) -> _Paint:
-    """PyVista's way."""
-    library = pyvista()
-    from vtkmodules.vtkCommonCore import vtkLogger
-
-    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # of screens that are not there
-
-    def paint(axes: Any, view: View, share: float) -> None:
-        width, height = view.high - view.low
-        plotter = library.Plotter(off_screen=True, window_size=(_PIXELS, round(_PIXELS * height / width)))
-        plotter.enable_anti_aliasing("ssaa")
-        _add(plotter, solid, share, float(_norm(solid).vmax))
-        middle = view.low + (view.high - view.low) / 2
-        at, far = view.right * middle[0] + view.up * middle[1], 4 * max(width, height)
-        depth = float((solid.points @ view.towards).mean())
-        plotter.camera.parallel_projection = True
-        plotter.camera_position = [at + (depth + far) * view.towards, at + depth * view.towards, view.up]
-        plotter.camera.parallel_scale = height / 2
-        plotter.camera.clipping_range = (0.1 * far, 4 * far)
-        image = plotter.screenshot(return_img=True)
-        plotter.close()
-        axes.imshow(image, extent=(view.low[0], view.high[0], view.low[1], view.high[1]))
-
-    return paint
+    width, height = view.high - view.low
+    plotter = pyvista.Plotter(off_screen=True, window_size=[_PIXELS, round(_PIXELS * height / width)])
+    plotter.enable_anti_aliasing("ssaa")
+    _add_meshes(plotter, solid, share, largest)
+    towards = np.cross(*view.axes)  # the viewer
+    depth, distance = float((solid.points @ towards).mean()), 4 * max(width, height)
+    focus = (view.low + view.high) / 2 @ view.axes + depth * towards
+    plotter.camera.parallel_projection = True
+    plotter.camera_position = [focus + distance * towards, focus, view.axes[1]]
+    plotter.camera.parallel_scale = height / 2
+    plotter.camera.clipping_range = (0.1 * distance, 4 * distance)
+    image = plotter.screenshot(return_img=True)
+    plotter.close()
+    return np.asarray(image)
 
 
-def _add(plotter: Any, solid: Solid, share: float, largest: float) -> None:
-    """Put the parts with a share of the displacement into a plotter, and the body around them; largest is in mm."""
-    shown = parts(solid)
-    light = {"ambient": 0.4, "diffuse": 0.6, "show_scalar_bar": False}
+def _add_meshes(plotter: Any, solid: Any, share: float, largest: float) -> None:
+    """Add the parts with a share of their displacements to a plotter, and the body around them; largest is in mm."""
+    from mpitled.results.cuts import MAP
+    from mpitled.results.solid import SIZE, deformed
+
+    shown = _parts(solid)
     if "body" not in shown:
-        # Its far side alone, which does not lie before the parts and change their colours.
-        body = _surface(solid, solid.surface, share)
-        plotter.add_mesh(body, color=COLOURS["body"], opacity=_THIN, culling="front", name="around", **light)
-    for name, triangles in shown.items():
-        moved = share and name not in _PLAIN
-        paint = {"scalars": _SCALARS, "cmap": MAP, "clim": (0, largest)} if moved else {"color": COLOURS[name]}
-        plotter.add_mesh(_surface(solid, triangles, share), name=name, **paint, **light)
-
-
-def _surface(solid: Solid, triangles: NDArray[np.int64], share: float) -> Any:
-    """pyvista.PolyData of triangles with a share of the displacement, mm."""
-    nodes, corners = np.unique(triangles, return_inverse=True)
-    mesh = pyvista().PolyData.from_regular_faces(
-        (solid.points + share * solid.displacement)[nodes], corners.reshape(-1, 3)
-    )
-    mesh.point_data[_SCALARS] = np.linalg.norm(solid.displacement[nodes], axis=1)
-    return mesh
-
-
-def _painter(solid: Solid) -> _Paint:
-    """Matplotlib's way: triangles from the farthest to the nearest, shaded by where they face."""
-    from matplotlib import colormaps
-    from matplotlib.collections import PolyCollection
-    from matplotlib.colors import to_rgb
-
-    shown, norm = parts(solid), _norm(solid)
-    triangles = np.concatenate(list(shown.values()))
-    plain = np.repeat([to_rgb(COLOURS[name]) for name in shown], [len(of) for of in shown.values()], axis=0)
-    size = np.linalg.norm(solid.displacement, axis=1)[triangles].mean(axis=1)
-    moved = colormaps[MAP](norm(size))[:, :3]
-    alike = np.repeat([name in _PLAIN for name in shown], [len(of) for of in shown.values()])
-    moved[alike] = plain[alike]
-
-    def paint(axes: Any, view: View, share: float) -> None:
-        places = solid.points + share * solid.displacement
-        if "body" not in shown:
-            body = view.flat(places[solid.surface])
-            axes.add_collection(PolyCollection(list(body), facecolors="#ece9e4", edgecolors="#ece9e4"))
-        corners = places[triangles]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        facing = np.abs(normals @ view.towards) / np.maximum(np.linalg.norm(normals, axis=1), 1e-300)
-        fill = (moved if share else plain) * (0.55 + 0.45 * facing[:, None])
-        order = np.argsort(corners.mean(axis=1) @ view.towards)
-        axes.add_collection(
-            PolyCollection(
-                list(view.flat(corners)[order]), facecolors=fill[order], edgecolors=fill[order], linewidths=0.3
-            )
-        )
-
-    return paint
+        # Only the far side of the body: the near side would change the colours of the parts.
+        body = deformed(solid.surface, share)
+        plotter.add_mesh(body, color=COLOURS["body"], opacity=_OPACITY, culling="front", name="around", **_LIGHT)
+    for name, mesh in shown.items():
+        coloured = {"scalars": SIZE, "cmap": MAP, "clim": (0, largest)}
+        style = coloured if share and name not in _PLAIN else {"color": COLOURS[name]}
+        plotter.add_mesh(deformed(mesh, share), name=name, **style, **_LIGHT)
