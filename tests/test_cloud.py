@@ -10,7 +10,11 @@ from mpitled import deck
 from mpitled.errors import InputError
 from mpitled.mesh import grid_points, structured_hexahedra
 from mpitled.meshing.block import block_mesh
-from mpitled.meshing.cloud import CLOSEST, Spacing, boundary_faces, cut, fill_void, subdivide, volumes_and_centroids
+from mpitled.meshing.cloud import build_cloud
+from mpitled.meshing.faces import boundary_faces
+from mpitled.meshing.integration_cells import cut, subdivide, volumes_and_centroids
+from mpitled.meshing.scatter import CLOSEST
+from mpitled.meshing.spacing import Spacing
 
 CLOUD = deck.Cloud(points_per_spacing=1.4, growth=0.3)
 SEED_VOLUME = 4 / 3 * np.pi * 0.002**3
@@ -69,7 +73,7 @@ def test_cloud_around_a_seed(shape):
     middle = points[hexahedra].mean(axis=1)
     centre = middle[555] + 0.0007
     dropped = np.linalg.norm(middle - centre, axis=1) < 0.014
-    filling = fill_void(points, hexahedra, dropped, CLOUD, tumour(tuple(centre)), 0.004)
+    filling = build_cloud(points, hexahedra, dropped, CLOUD, tumour(tuple(centre)), 0.004)
 
     void = flux_volume(points, boundary_faces(hexahedra[dropped]))
     volumes = filling.integration_volumes
@@ -110,7 +114,7 @@ def test_cloud_around_a_seed(shape):
 def test_hexahedra_that_remain_keep_their_nodes_and_no_node_is_orphaned():
     points, hexahedra = distorted_block()
     dropped = np.linalg.norm(points[hexahedra].mean(axis=1) - points.mean(axis=0), axis=1) < 0.012
-    filling = fill_void(points, hexahedra, dropped, CLOUD, None, 0.004)
+    filling = build_cloud(points, hexahedra, dropped, CLOUD, None, 0.004)
     np.testing.assert_array_equal(filling.points[filling.hexahedra], points[hexahedra[~dropped]])
     np.testing.assert_array_equal(np.unique(filling.hexahedra), np.arange(filling.n_fe_nodes))
     void_boundary = np.unique(boundary_faces(hexahedra[dropped]))
@@ -124,7 +128,7 @@ def test_same_deck_same_bits_and_another_seed_another_cloud():
     points, hexahedra = distorted_block()
     dropped = np.linalg.norm(points[hexahedra].mean(axis=1) - points.mean(axis=0), axis=1) < 0.012
     one, two, other = (
-        fill_void(points, hexahedra, dropped, deck.Cloud(seed=seed), tumour(tuple(points.mean(axis=0))), 0.004)
+        build_cloud(points, hexahedra, dropped, deck.Cloud(seed=seed), tumour(tuple(points.mean(axis=0))), 0.004)
         for seed in (0, 0, 1)
     )
     for name in ("points", "integration_points", "integration_volumes", "hexahedra"):

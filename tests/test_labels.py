@@ -14,8 +14,9 @@ from scipy.sparse.csgraph import connected_components
 
 from mpitled import deck
 from mpitled.errors import InputError
-from mpitled.meshing.cloud import FACES, boundary_faces
-from mpitled.meshing.labels import mesh_labels, solid_cells
+from mpitled.meshing.faces import FACES, boundary_faces
+from mpitled.meshing.head import solid_cells
+from mpitled.meshing.labels import mesh_labels
 
 nibabel = pytest.importorskip("nibabel")
 
@@ -340,7 +341,7 @@ def test_an_image_may_have_more_axes_than_it_needs_and_has_to_say_where_it_is(tm
     assert any("element_size = 0.9 mm: is smaller than a voxel" in remark for remark in same.remarks)
     nibabel.save(nibabel.Nifti1Image(data[..., None], None), tmp_path / "nowhere.nii")
     mesh = mesh_labels(labels_of(tmp_path / "nowhere.nii"), deck.Cloud(), None)
-    assert any("does not say where its voxels are" in remark for remark in mesh.remarks)
+    assert any("does not give the position of its voxels" in remark for remark in mesh.remarks)
 
 
 def test_a_centre_in_voxels_is_told_in_millimetres(tmp_path):

@@ -13,7 +13,9 @@ from mpitled import deck, store
 from mpitled.batch.exact import layers
 from mpitled.errors import InputError
 from mpitled.mesh import grid_points, structured_hexahedra
-from mpitled.meshing.cloud import CLOSEST, fill_void, volumes_and_centroids
+from mpitled.meshing.cloud import build_cloud
+from mpitled.meshing.integration_cells import volumes_and_centroids
+from mpitled.meshing.scatter import CLOSEST
 from mpitled.model.build import build, discretise, read_mesh
 from mpitled.parallel.subdomain import localise
 from mpitled.results import field
@@ -184,7 +186,7 @@ def test_a_cloud_is_as_fine_as_the_interface(tmp_path):
     sphere = deck.Sphere(name="upper", centre=(0.012, 0.012, 1.016), radius=1.0)
     dropped = np.ones(len(hexahedra), bool)
     coarse, fine = (
-        fill_void(points, hexahedra, dropped, deck.Cloud(), None, 0.004, spheres) for spheres in ((), (sphere,))
+        build_cloud(points, hexahedra, dropped, deck.Cloud(), None, 0.004, spheres) for spheres in ((), (sphere,))
     )
     assert len(coarse.parts) == 1
     inside = [(np.abs(f.points - [0.012, 0.012, 0.016]) < [0.01, 0.01, 0.004]).all(axis=1) for f in (coarse, fine)]

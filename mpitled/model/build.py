@@ -15,8 +15,8 @@ from mpitled.deck import Deck, Sphere
 from mpitled.errors import InputError
 from mpitled.material import Material
 from mpitled.mesh import Constraint, Mesh, Part, named_set
-from mpitled.meshing import block, checks, labels, phantoms
-from mpitled.meshing.cloud import in_millimetres, in_sphere, length, looks_like_metres
+from mpitled.meshing import block, checks, label_image, labels, phantoms
+from mpitled.meshing.placement import format_length, format_position, in_sphere, unit_hint
 from mpitled.model import Model
 from mpitled.model.loading import growth, sphere_radius, turn
 from mpitled.model.mapping import carry_over
@@ -184,8 +184,9 @@ def _check_growth(deck: Deck, mesh: Mesh, dofs: NDArray[np.int64], displacements
     radius, room = sphere_radius(deck.tumour.volume), float(distances.min(initial=np.inf))
     if radius > room:
         raise InputError(
-            f"{deck.path}: tumour.volume = {1e9 * deck.tumour.volume:.10g}: its sphere of {length(radius)} radius "
-            f"reaches beyond the outer surface, which is fixed {length(room)} from tumour.centre; lower it"
+            f"{deck.path}: tumour.volume = {1e9 * deck.tumour.volume:.10g}: its sphere of {format_length(radius)} "
+            f"radius reaches beyond the outer surface, which is fixed {format_length(room)} from tumour.centre; "
+            "lower it"
         )
 
 
@@ -207,8 +208,8 @@ def _slips(deck: Deck, mesh: Mesh, material: NDArray[np.int16], materials: tuple
     if deck.tumour is None:
         return
     centre = np.asarray(deck.tumour.centre)
-    if said := looks_like_metres(centre, mesh.points.min(axis=0), mesh.points.max(axis=0)):
-        yield f"warning: tumour.centre = {in_millimetres(centre)}: {said}"
+    if said := unit_hint(centre, mesh.points.min(axis=0), mesh.points.max(axis=0)):
+        yield f"warning: tumour.centre = {format_position(centre)}: {said}"
     grows_in = materials[material[((_middles(mesh) - centre) ** 2).sum(axis=1).argmin()]]
     if grows_in.youngs_modulus < SOFTEST and grows_in.name not in told:
         what = f"material.{grows_in.name}.youngs_modulus = {grows_in.youngs_modulus:.10g}"
@@ -245,12 +246,12 @@ def _growth_remarks(deck: Deck) -> Iterator[str]:
             f"warning: tumour.seed_radius = {1e3 * seed:.10g}: {share:.0%} of tumour.volume is there at the start and "
             "moves nothing, and only the rest is grown; make it smaller"
         )
-    grows = f"warning: the tumour grows to a radius of {length(radius)}"
+    grows = f"warning: the tumour grows to a radius of {format_length(radius)}"
     if radius > GREATEST_GROWTH * seed:
         times = f"{radius / seed:.3g} times its seed's"
         yield f"{grows}, {times}, where cells may turn inside out; enlarge tumour.seed_radius"
     if radius > deck.cloud.radius and not deck.mesh:
-        yield f"{grows}, beyond the cloud's {length(deck.cloud.radius)}; enlarge cloud.radius"
+        yield f"{grows}, beyond the cloud's {format_length(deck.cloud.radius)}; enlarge cloud.radius"
 
 
 def _domains(deck: Deck, mesh: Mesh, material: NDArray[np.int16]) -> tuple[NDArray[np.int64], dict[str, float]]:
@@ -392,7 +393,7 @@ def _materials(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int16], tuple[Materia
     the others are none of the model's. Ventricles of which the deck says that there are none need no material, and may
     have one.
     """
-    absent = {name for name in labels.VENTRICLES if deck.labels and not getattr(deck.labels, name)}
+    absent = {name for name in label_image.VENTRICLES if deck.labels and not getattr(deck.labels, name)}
     claims = [(name, section.material) for section in deck.materials for name in section.cells if name not in absent]
     materials = list(dict.fromkeys(material for _, material in claims))
     chosen = np.full(mesh.n_cells, -1, np.int16)

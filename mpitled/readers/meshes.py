@@ -24,7 +24,7 @@ from mpitled.errors import InputError
 from mpitled.material import Material
 from mpitled.mesh import METRES, Constraint, Mesh
 from mpitled.meshing import checks
-from mpitled.meshing.cloud import subdivide, volumes_and_centroids
+from mpitled.meshing.integration_cells import subdivide, volumes_and_centroids
 from mpitled.readers import abaqus, lsdyna, meshfile, tables
 from mpitled.readers.meshfile import Cells, MeshFile
 

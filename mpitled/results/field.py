@@ -14,7 +14,7 @@ from mpitled import store
 from mpitled.cells.support_domains import moving_least_squares
 from mpitled.errors import InputError, damaged
 from mpitled.mesh import CORNERS
-from mpitled.meshing.cloud import boundary_faces
+from mpitled.meshing.faces import boundary_faces
 from mpitled.model import Model
 
 #: Where a value came from: inside a hexahedron, a support domain, or the hexahedron next to a place outside the mesh.

@@ -23,7 +23,7 @@ from scipy import ndimage
 
 from mpitled import atomic, deck, resources
 from mpitled.errors import InputError, damaged
-from mpitled.meshing.labels import VENTRICLES, Cells, Image, parts_of, read_image
+from mpitled.meshing.label_image import VENTRICLES, Image, Mask, read_image, segment
 from mpitled.results.field import Field, open_field
 
 DISPLACEMENT, INVERSE, LABELS = "displacement.nii.gz", "inverse_displacement.nii.gz", "labels.nii.gz"
@@ -56,7 +56,7 @@ class _Ball:
         """Which places (n, 3), m, lie inside."""
         return np.asarray(((places - self.centre) ** 2).sum(axis=1) < self.radius**2)
 
-    def voxels(self, image: Image) -> Cells:
+    def voxels(self, image: Image) -> Mask:
         """The image's voxels (nz, ny, nx) whose middles lie inside."""
         x, y, z = (
             (image.origin[i] + image.voxel[i] * (np.arange(n) + 0.5) - self.centre[i]) ** 2
@@ -113,7 +113,7 @@ def write_nifti(run: Path, directory: Path) -> Written:
     return Written(paths, label, missed, field.share, field.complete)
 
 
-def _carried(image: Image, body: Cells, ventricles: Sequence[Cells], before: NDArray[np.float64]) -> NDArray[np.int32]:
+def _carried(image: Image, body: Mask, ventricles: Sequence[Mask], before: NDArray[np.float64]) -> NDArray[np.int32]:
     """Labels (n,) of voxels whose middles came from the places before (n, 3), in voxels by z, y, x.
 
     It is the label of the voxel that holds the place, but for the ventricles: where all moves by less than half a
@@ -136,7 +136,7 @@ def _carried(image: Image, body: Cells, ventricles: Sequence[Cells], before: NDA
     return labels
 
 
-def _image_of(field: Field, run: Path) -> tuple[Image, Cells, list[Cells]]:
+def _image_of(field: Field, run: Path) -> tuple[Image, Mask, list[Mask]]:
     """The label image of a run, its voxels (nz, ny, nx) of the body, and those of each ventricle.
 
     InputError if it is not there or not what it was.
@@ -157,7 +157,7 @@ def _image_of(field: Field, run: Path) -> tuple[Image, Cells, list[Cells]]:
         raise InputError(f"{path}: the label image of {run} is not there; put it back")
     image = read_image(path)
     try:
-        body, parts, _ = parts_of(image, labels)
+        body, parts, _ = segment(image, labels)
     except InputError as error:
         raise InputError(f"{error}; it has changed since {run} was computed") from None
     voxel = float(image.voxel.prod())
@@ -187,7 +187,7 @@ def _balls(field: Field) -> tuple[_Ball, _Ball] | tuple[None, None]:
     return seed, tumour
 
 
-def _reached(image: Image, body: Cells, index: NDArray[np.int64], displacement: NDArray[np.float64]) -> Cells:
+def _reached(image: Image, body: Mask, index: NDArray[np.int64], displacement: NDArray[np.float64]) -> Mask:
     """Voxels (nz, ny, nx) where the body may be by now: no farther from where it was than its surface has moved."""
     surface = body & ~ndimage.binary_erosion(body)
     far = np.linalg.norm(displacement[surface[tuple(index.T)]], axis=1).max()

@@ -18,7 +18,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mpitled.meshing.cloud import FACES
+from mpitled.meshing.faces import FACES
 from mpitled.model import Model
 from mpitled.results.solid import Solid, cut_tetrahedra, cut_triangles, triangles_of
 

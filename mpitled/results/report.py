@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from mpitled import atomic, store
 from mpitled.cells import hexahedra
 from mpitled.errors import InputError, damaged
-from mpitled.meshing.cloud import boundary_faces, interface_faces
+from mpitled.meshing.faces import boundary_faces, interface_faces
 from mpitled.model import Model
 from mpitled.results.solid import Solid, solid_of
 

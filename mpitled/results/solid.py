@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay, cKDTree
 
-from mpitled.meshing.cloud import boundary_faces, interface_faces
+from mpitled.meshing.faces import boundary_faces, interface_faces
 from mpitled.model import Model
 
 #: A place of the cloud has an integration point this near, in cube roots of that point's volume; a hollow has none.
