@@ -74,7 +74,7 @@ def test_what_is_skipped_is_listed_if_it_may_matter(tmp_path):
     """Titles and requests for output are in every deck; those of contacts are no contacts."""
     output = "*OUTPUT, FIELD\n*NODE OUTPUT\n U,\n*CONTACT OUTPUT\n CSTRESS,\n*RESTART, WRITE\n*END STEP"
     file = read(tmp_path, FLAT.replace("*STATIC", "*VISCO").replace("*END STEP", output))
-    assert file.remarks == [f"{tmp_path / 'deck.inp'}: skipped, for nothing here depends on it: *VISCO"]
+    assert file.remarks == [f"{tmp_path / 'deck.inp'}: skipped, because the results do not depend on it: *VISCO"]
     assert file.refused == []
 
 
@@ -91,7 +91,7 @@ def test_a_deck_that_is_cut_short_says_where(tmp_path):
         read(tmp_path, whole)
     clipped = read(tmp_path, FLAT + cut)
     assert [remark.partition("deck.inp: ")[2] for remark in clipped.remarks if "warning" in remark] == [
-        "part Cube is in no *INSTANCE, so not there",
+        "part Cube has no *INSTANCE and is left out",
         "the file ends within *PART Cube: is it cut short?",
     ]
 
@@ -227,7 +227,7 @@ def test_later_steps_take_nodes_over(tmp_path):
     assert at[35, 0] == {0.25}
     assert at[10, 0] == {-0.5}
     assert at[10, 1] == {0.0}
-    assert any("several steps; those at the end count" in remark for remark in file.remarks)
+    assert any("several steps; those of the last step count" in remark for remark in file.remarks)
     assert not any("several steps" in remark for remark in read(tmp_path, FLAT).remarks)  # held first, then moved
     new = read(tmp_path, FLAT + more.replace("*BOUNDARY", "*BOUNDARY, OP=NEW"))
     assert {c.displacement for c in new.constraints} == {(0.5,), (-0.5,)}
@@ -330,7 +330,7 @@ WRONG = {
     "missing include": ("*INCLUDE, INPUT=gone.inp\n" + FLAT, "line 1: *INCLUDE names gone.inp"),
     "circle": ("*INCLUDE, INPUT=deck.inp\n" + FLAT, "break the circle"),
     "unknown part": (ASSEMBLY.replace("part=Cube\n", "part=Cub\n", 1), "names part Cub"),
-    "copies": (FLAT.replace("*ELEMENT", "*NGEN\n 10, 20\n*ELEMENT"), "*NGEN makes nodes"),
+    "copies": (FLAT.replace("*ELEMENT", "*NGEN\n 10, 20\n*ELEMENT"), "*NGEN generates nodes"),
 }
 
 

@@ -275,7 +275,7 @@ def test_flat_hexahedra_and_coincident_nodes(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("*DENSITY\n 1e-9,\n", "", "line 28: material brain has no density; 1000 kg/m3 is taken"),
+        ("*DENSITY\n 1e-9,\n", "", "line 28: material brain has no density; 1000 kg/m3 is used"),
         ("left, 1, 3", "left, 2", "can move as a rigid body (1 of 6 motions)"),
         (" 3, 20, 30, 35, 25, 120,", " 3, 21, 30, 35, 26, 121,", "the mesh is in 2 pieces that share no node"),
         (" left, 1, 3", "** left", ""),
@@ -456,7 +456,7 @@ def test_a_load_that_is_not_applied_is_a_warning_of_the_result(tmp_path):
     (tmp_path / "scene.toml").write_text(
         '[mesh]\nfe = "fe.inp"\nunit = "mm"\nstress_unit = "MPa"\n[solver]\nmethod = "quasi-static"\nload_time = 0.01\n'
     )
-    told = f"{tmp_path / 'fe.inp'}: line 39: *DSLOAD is not applied, as no load is"
+    told = f"{tmp_path / 'fe.inp'}: line 39: *DSLOAD is not applied: loads are not supported"
     done = mpitled("run", tmp_path / "scene.toml", "--out", tmp_path / "out")
     assert [line for line in done.stderr.splitlines() if "DSLOAD" in line] == [f"warning: {told}"]
     assert [line.strip() for line in done.stdout.splitlines() if "DSLOAD" in line] == [f"warning: {told}"]

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpitled.errors import InputError
-from mpitled.mesh import Mesh, check_size, grid_points, hexahedral_mesh, structured_hexahedra
+from mpitled.mesh import Bools, Floats, Ints, Mesh, check_size, grid_points, hexahedral_mesh, structured_hexahedra
 from mpitled.meshing.cloud import mesh_with_cloud, near_centre
 from mpitled.meshing.o_grid import OGrid, shell_cells, whole_number
 from mpitled.meshing.placement import format_position
@@ -69,20 +68,14 @@ def block_mesh(
     return mesh_with_cloud(corner + local, hexahedra, core, node_sets, cloud, tumour, element_size, spheres)
 
 
-def _inner(shape: NDArray[np.int64], share: float) -> NDArray[np.bool_]:
+def _inner(shape: Ints, share: float) -> Bools:
     """Hexahedra in the middle of a grid, with equal margins of at least one hexahedron on all sides."""
     margin = np.maximum(np.floor((1 - share) / 2 * shape + 0.5), 1)
     cell = np.indices(tuple(shape[::-1])).reshape(3, -1)[::-1].T
     return ((cell >= margin) & (cell < shape - margin)).all(axis=1)
 
 
-def _fitted(
-    size: NDArray[np.float64],
-    shape: NDArray[np.int64],
-    centre: NDArray[np.float64],
-    sphere: deck.Sphere,
-    share: float,
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
+def _fitted(size: Floats, shape: Ints, centre: Floats, sphere: deck.Sphere, share: float) -> tuple[Floats, Ints, Bools]:
     """Nodes (n, 3) in the block [0, size], hexahedra (m, 8), and which of them lie in the core.
 
     The ball is an O-grid. Layers from the ball to the faces thicken with the distance as the cells widen. The core ends

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpitled.cells import hexahedra
+from mpitled.mesh import Bools, Floats, Ints
 from mpitled.meshing.faces import FACES
 
 #: Other programs' orders of a hexahedron's nodes: top and bottom exchanged (or mirrored), along x, then y, then z, and
@@ -20,7 +20,7 @@ _FREE = 1e-6
 _NEAR = 16  # cells with the nearest centres that are tested for holding a point
 
 
-def reordered(points: NDArray[np.float64], cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
+def reordered(points: Floats, cells: Ints, rows: Ints) -> Ints:
     """Hexahedra (len(rows), 8) with their nodes in an order that makes them valid; rows of -1 where no order does."""
     found = np.full((len(rows), 8), -1, np.int64)
     for order in ORDERS:
@@ -31,7 +31,7 @@ def reordered(points: NDArray[np.float64], cells: NDArray[np.int64], rows: NDArr
     return found
 
 
-def coincident(points: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
+def coincident(points: Floats, tolerance: float) -> Ints:
     """Nodes (n,), ascending, that have an earlier node at the same point or within the tolerance, m."""
     order = np.lexsort(points.T)
     same = (np.diff(points[order], axis=0) == 0).all(axis=1)
@@ -44,7 +44,7 @@ def coincident(points: NDArray[np.float64], tolerance: float) -> NDArray[np.int6
     return np.sort(np.concatenate(found))
 
 
-def repeated(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def repeated(cells: Ints) -> tuple[Ints, Ints]:
     """Rows of cells (n, k) with the same nodes, in any order, as an earlier row, and these earlier rows."""
     # Sums of hashed numbers (Steele et al. 2014) identify sets of nodes up to a probability of 2^-64.
     sums = np.zeros(len(cells), np.uint64)
@@ -57,7 +57,7 @@ def repeated(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.in
     return order[again], order[again - 1]
 
 
-def pieces(cells: Sequence[NDArray[np.int64]], n_nodes: int) -> NDArray[np.int64]:
+def pieces(cells: Sequence[Ints], n_nodes: int) -> Ints:
     """Connected piece (n_nodes,) of each node: 0, 1, ...; -1 without a cell. The nodes of a cell are in one piece."""
     parent = np.arange(n_nodes)
     used = np.zeros(n_nodes, bool)
@@ -98,7 +98,7 @@ def _roots(parent):  # type: ignore[no-untyped-def]
     return parent
 
 
-def free_rigid_modes(points: NDArray[np.float64], dofs: NDArray[np.int64]) -> int:
+def free_rigid_modes(points: Floats, dofs: Ints) -> int:
     """Number of the six rigid motions (small rotations) that leave all prescribed dofs at rest."""
     if len(dofs) == 0:
         return 6
@@ -115,13 +115,7 @@ def free_rigid_modes(points: NDArray[np.float64], dofs: NDArray[np.int64]) -> in
     return int(np.count_nonzero(values <= _FREE**2 * values[-1]))
 
 
-def scene_remarks(
-    points: NDArray[np.float64],
-    cells: NDArray[np.int64],
-    domains: NDArray[np.int64],
-    n_fe_nodes: int,
-    dofs: NDArray[np.int64],
-) -> list[str]:
+def scene_remarks(points: Floats, cells: Ints, domains: Ints, n_fe_nodes: int, dofs: Ints) -> list[str]:
     """Warnings about the model: separate pieces, free rigid motion, support domains with FE nodes only."""
     piece = pieces([cells, domains], len(points))
     n_pieces = int(piece.max(initial=-1)) + 1
@@ -156,7 +150,7 @@ def scene_remarks(
     return found
 
 
-def inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+def inside(points: Floats, corners: Floats) -> Bools:
     """Which points (n, 3) lie inside one of the hexahedra with corners (m, 8, 3); faces are treated as planes.
 
     Corners may coincide, as in a tetrahedron. A point in the plane of a face counts as outside both neighbours: the
@@ -180,7 +174,7 @@ def inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray
     return found
 
 
-def enclosed_volume(points: NDArray[np.float64], faces: NDArray[np.int64]) -> float | None:
+def enclosed_volume(points: Floats, faces: Ints) -> float | None:
     """Volume, m^3, inside a closed surface of quadrilaterals (n, 4) seen from outside; None if it is not closed."""
     edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     if not len(faces) or (np.unique(edges, axis=0, return_counts=True)[1] % 2).any():

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpitled import resources
 from mpitled.cells.hexahedra import geometry, nodal_sum
 from mpitled.errors import InputError
-from mpitled.mesh import Mesh, Part, numbered_mesh
+from mpitled.mesh import Bools, Floats, Ints, Mesh, Part, numbered_mesh
 from mpitled.meshing import placement
 from mpitled.meshing.faces import boundary_faces
 from mpitled.meshing.integration_cells import cut, edge_lengths, outside_seed, volumes_and_centroids
@@ -32,29 +31,29 @@ _REMEDY = "ask for fewer"
 class CloudMesh:
     """The hexahedra that remain and the cloud that replaces the others; FE nodes first, then EFG nodes."""
 
-    points: NDArray[np.float64]  # (n_nodes, 3), m
+    points: Floats  # (n_nodes, 3), m
     n_fe_nodes: int
-    hexahedra: NDArray[np.int64]  # (n_hexahedra, 8), the remaining rows, renumbered
-    new_numbers: NDArray[np.int64]  # (n_points_given,), new number of each given node; -1 if it was removed
-    integration_points: NDArray[np.float64]  # (n_integration, 3), m
-    integration_volumes: NDArray[np.float64]  # (n_integration,), m^3
-    interface: NDArray[np.int64]  # FE nodes on the void's boundary, ascending
-    seed_nodes: NDArray[np.int64]  # EFG nodes on the seed's surface, ascending
-    surface_areas: NDArray[np.float64]  # (n_nodes, 3), m^2: see `Mesh`
+    hexahedra: Ints  # (n_hexahedra, 8), the remaining rows, renumbered
+    new_numbers: Ints  # (n_points_given,), new number of each given node; -1 if it was removed
+    integration_points: Floats  # (n_integration, 3), m
+    integration_volumes: Floats  # (n_integration,), m^3
+    interface: Ints  # FE nodes on the void's boundary, ascending
+    seed_nodes: Ints  # EFG nodes on the seed's surface, ascending
+    surface_areas: Floats  # (n_nodes, 3), m^2: see `Mesh`
     parts: tuple[Part, ...]  # see `Mesh`
     spacing: Spacing
     figures: dict[str, float]
 
-    def renumber(self, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+    def renumber(self, nodes: Ints) -> Ints:
         """New numbers, ascending, of those of the given mesh's nodes that remain."""
         new = self.new_numbers[nodes]
         return np.unique(new[new >= 0])
 
 
 def build_cloud(
-    points: NDArray[np.float64],
-    hexahedra: NDArray[np.int64],
-    replaced: NDArray[np.bool_],
+    points: Floats,
+    hexahedra: Ints,
+    replaced: Bools,
     cloud: deck.Cloud,
     tumour: deck.Tumour | None,
     element_size: float,
@@ -143,10 +142,10 @@ def build_cloud(
 
 
 def mesh_with_cloud(
-    points: NDArray[np.float64],
-    hexahedra: NDArray[np.int64],
-    replaced: NDArray[np.bool_],
-    node_sets: dict[str, NDArray[np.int64]],
+    points: Floats,
+    hexahedra: Ints,
+    replaced: Bools,
+    node_sets: dict[str, Ints],
     cloud: deck.Cloud,
     tumour: deck.Tumour | None,
     element_size: float,
@@ -170,15 +169,13 @@ def mesh_with_cloud(
     )
 
 
-def near_centre(
-    points: NDArray[np.float64], hexahedra: NDArray[np.int64], tumour: deck.Tumour, radius: float
-) -> NDArray[np.bool_]:
+def near_centre(points: Floats, hexahedra: Ints, tumour: deck.Tumour, radius: float) -> Bools:
     """Hexahedra (n,) with their centre within the radius, m, of the tumour's centre."""
     distance = np.linalg.norm(points[hexahedra].mean(axis=1) - np.asarray(tumour.centre), axis=1)
     return np.asarray(distance <= radius)
 
 
-def _seed(cloud: deck.Cloud, tumour: deck.Tumour | None, element_size: float) -> tuple[NDArray[np.float64], Spacing]:
+def _seed(cloud: deck.Cloud, tumour: deck.Tumour | None, element_size: float) -> tuple[Floats, Spacing]:
     """Nodes on the seed's surface and the spacing around it."""
     largest = cloud.spacing or element_size
     if tumour is None:
@@ -194,7 +191,7 @@ def _seed(cloud: deck.Cloud, tumour: deck.Tumour | None, element_size: float) ->
     return centre + radius * fibonacci_sphere(n), Spacing(largest, cloud.growth, centre, radius, float(at_surface))
 
 
-def _check_memory(cells: NDArray[np.float64], volume: float, spacing: Spacing, per_spacing: float) -> None:
+def _check_memory(cells: Floats, volume: float, spacing: Spacing, per_spacing: float) -> None:
     """InputError if the nodes and integration points of cells (n, 8, 3) of that volume, m^3, exceed the memory.
 
     Flat cells are cut along their edges only, into more parts than their volume asks for.
@@ -206,9 +203,7 @@ def _check_memory(cells: NDArray[np.float64], volume: float, spacing: Spacing, p
     resources.check_memory(_BYTES * n, request, f"{_REMEDY} by spacing, growth or points_per_spacing")
 
 
-def _split(
-    centres: NDArray[np.float64], spheres: Sequence[deck.Sphere]
-) -> tuple[list[tuple[str, ...]], NDArray[np.int64]]:
+def _split(centres: Floats, spheres: Sequence[deck.Sphere]) -> tuple[list[tuple[str, ...]], Ints]:
     """Names of the spheres around each part of the cloud, and the part (n,) of hexahedra with centres (n, 3)."""
     inside = np.zeros((len(centres), len(spheres)), bool)
     for i, sphere in enumerate(spheres):
@@ -219,8 +214,8 @@ def _split(
 
 
 def _integrate(
-    pieces: list[NDArray[np.float64]], spacing: Spacing, per_spacing: float, rng: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], dict[str, float]]:
+    pieces: list[Floats], spacing: Spacing, per_spacing: float, rng: np.random.Generator
+) -> tuple[Floats, Floats, Ints, dict[str, float]]:
     """Volumes, points and parts of the integration cells in each part's hexahedra (n, 8, 3), and figures."""
     parts = [cut(piece, spacing, per_spacing, rng) for piece in pieces]
     cells = np.concatenate(parts)
@@ -232,9 +227,7 @@ def _integrate(
     return volumes, centroids, part_of_point[rows], {"integration_volume_before_rescaling_m3": sampled}
 
 
-def _surface_areas(
-    points: NDArray[np.float64], hexahedra: NDArray[np.int64], at: NDArray[np.bool_]
-) -> NDArray[np.float64]:
+def _surface_areas(points: Floats, hexahedra: Ints, at: Bools) -> Floats:
     """Integral of N_a n over the surface of hexahedra, (n_points, 3), m^2, at the chosen nodes; 0 at all others."""
     around = hexahedra[at[hexahedra].any(axis=1)]
     gradients, weights = geometry(points, around)

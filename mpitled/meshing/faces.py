@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+
+from mpitled.mesh import Floats, Ints
 
 #: The six faces of a hexahedron in the Abaqus/VTK order, anticlockwise seen from outside.
 FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
 
 
-def unshared(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+def unshared(faces: Ints) -> Ints:
     """Rows, ascending, of the faces or edges (n, k) with a set of nodes that no other row has."""
     key = np.sort(faces, axis=1)
     order = np.lexsort(key.T)
@@ -19,23 +20,18 @@ def unshared(faces: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.sort(order[~repeated[: len(order)]])
 
 
-def boundary_faces(hexahedra: NDArray[np.int64]) -> NDArray[np.int64]:
+def boundary_faces(hexahedra: Ints) -> Ints:
     """Faces (n, 4) that belong to one hexahedron only, anticlockwise seen from outside."""
     faces = hexahedra[:, FACES].reshape(-1, 4)
     return faces[unshared(faces)]
 
 
-def area_vectors(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+def area_vectors(corners: Floats) -> Floats:
     """Area times normal (n, 3), m^2, of quadrilaterals (n, 4, 3)."""
     return np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]) / 2
 
 
-def interface_faces(
-    points: NDArray[np.float64],
-    hexahedra: NDArray[np.int64],
-    interface: NDArray[np.int64],
-    integration_points: NDArray[np.float64],
-) -> NDArray[np.int64]:
+def interface_faces(points: Floats, hexahedra: Ints, interface: Ints, integration_points: Floats) -> Ints:
     """Faces (n, 4) between hexahedra and cloud, anticlockwise seen from the cloud.
 
     They belong to one hexahedron only, and all four nodes are interface nodes. A face on the outer surface may fulfil

@@ -8,21 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from mpitled import resources
 from mpitled.errors import InputError
-from mpitled.mesh import CORNERS, check_size
-from mpitled.meshing.label_image import (
-    VENTRICLES,
-    Image,
-    Mask,
-    largest_piece,
-    read_image,
-    segment,
-    without_cavities,
-)
+from mpitled.mesh import CORNERS, Bools, Floats, Ints, check_size
+from mpitled.meshing.label_image import VENTRICLES, Image, Mask, largest_piece, read_image, segment, without_cavities
 
 if TYPE_CHECKING:
     from mpitled import deck
@@ -34,28 +25,28 @@ _CUBE_BYTES = 60  # upper bound of the memory per cube of the grid while the hea
 class Grid:
     """The cubes from which the solid's hexahedra are chosen; at least one layer around the solid stays empty."""
 
-    origin: NDArray[np.float64]  # (3,), m
+    origin: Floats  # (3,), m
     size: float  # m
     shape: tuple[int, int, int]  # (nx, ny, nz)
 
-    def index(self, point: NDArray[np.float64]) -> tuple[int, int, int] | None:
+    def index(self, point: Floats) -> tuple[int, int, int] | None:
         """Index (z, y, x) of the cube that holds a point (3,), m; None outside the grid."""
         i = np.floor((point - self.origin) / self.size).astype(int)
         if (i < 0).any() or (i >= self.shape).any():
             return None
         return int(i[2]), int(i[1]), int(i[0])
 
-    def corners(self, mask: Mask) -> NDArray[np.float64]:
+    def corners(self, mask: Mask) -> Floats:
         """Lowest corners (n, 3), m, of the chosen cubes."""
         return np.asarray(self.origin + self.size * np.argwhere(mask)[:, ::-1])
 
-    def distance(self, mask: Mask, point: NDArray[np.float64]) -> float:
+    def distance(self, mask: Mask, point: Floats) -> float:
         """Distance, m, of a point (3,) from the nearest of the chosen cubes; infinite without any."""
         low = self.corners(mask)
         gap = np.maximum(np.maximum(low - point, point - low - self.size), 0.0)
         return float(np.linalg.norm(gap, axis=1).min(initial=np.inf))
 
-    def hexahedra(self, mask: Mask) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def hexahedra(self, mask: Mask) -> tuple[Floats, Ints]:
         """Points (n, 3) and hexahedra (m, 8) of the chosen cubes, both numbered along x, then y, then z."""
         nx, ny, _ = self.shape
         strides = np.array([1, nx + 1, (nx + 1) * (ny + 1)])
@@ -74,7 +65,7 @@ class Head:
     interior: Mask  # cubes of the solid without a node on its outer surface
     parts: dict[str, Mask]  # tissue and the ventricles
     figures: dict[str, float]  # volumes, in the image and as cubes
-    to_world: NDArray[np.float64]  # (3, 4), m: from the image's voxel indices (i, j, k, 1) to the world
+    to_world: Floats  # (3, 4), m: from the image's voxel indices (i, j, k, 1) to the world
     remarks: tuple[str, ...]
 
 
@@ -132,7 +123,7 @@ def _grid(image: Image, body: Mask, size: float) -> Grid:
     return Grid((low + high) / 2 - size * n / 2, size, (int(n[0]), int(n[1]), int(n[2])))
 
 
-def _filled_shares(image: Image, mask: Mask, grid: Grid) -> NDArray[np.float64]:
+def _filled_shares(image: Image, mask: Mask, grid: Grid) -> Floats:
     """Share (nz, ny, nx) of each of the grid's cubes that the masked voxels fill: an exact box integral."""
     share = mask.astype(float)
     for axis, i in ((0, 2), (1, 1), (2, 0)):
@@ -143,7 +134,7 @@ def _filled_shares(image: Image, mask: Mask, grid: Grid) -> NDArray[np.float64]:
     return share
 
 
-def solid_cells(share: NDArray[np.float64]) -> tuple[Mask, int]:
+def solid_cells(share: Floats) -> tuple[Mask, int]:
     """One face-connected manifold solid with the shares' total volume, and the number of cubes that repairs added."""
     target = round(float(share.sum()))
     n, best, error, repaired = target, np.zeros(share.shape, bool), np.inf, 0
@@ -160,7 +151,7 @@ def solid_cells(share: NDArray[np.float64]) -> tuple[Mask, int]:
     return best, repaired
 
 
-def _fullest(share: NDArray[np.float64], n: int) -> Mask:
+def _fullest(share: Floats, n: int) -> Mask:
     """The n cubes with the largest shares; the fuller neighbourhood breaks ties."""
     around = ndimage.uniform_filter(share, 3, mode="constant")
     order = np.argsort(-(share + 1e-3 * around), axis=None, kind="stable")
@@ -170,7 +161,7 @@ def _fullest(share: NDArray[np.float64], n: int) -> Mask:
     return mask.reshape(share.shape)
 
 
-def _manifold_patterns() -> NDArray[np.bool_]:
+def _manifold_patterns() -> Bools:
     """For each of 256 patterns of the 8 cubes at a node: are the full and the empty cubes each face-connected?
 
     Exactly then the surface at the node is a disc (or there is none). The test covers edges too.
@@ -182,7 +173,7 @@ def _manifold_patterns() -> NDArray[np.bool_]:
     return valid
 
 
-def _manifold(mask: Mask, share: NDArray[np.float64]) -> Mask:
+def _manifold(mask: Mask, share: Floats) -> Mask:
     """The mask with cubes added, largest share first, until its surface has no non-manifold edge or vertex."""
     valid = _manifold_patterns()
     mask = without_cavities(mask)
@@ -201,7 +192,7 @@ def _manifold(mask: Mask, share: NDArray[np.float64]) -> Mask:
         mask = without_cavities(full[1:-1, 1:-1, 1:-1])
 
 
-def _ventricles(shares: dict[str, NDArray[np.float64]], interior: Mask) -> dict[str, Mask]:
+def _ventricles(shares: dict[str, Floats], interior: Mask) -> dict[str, Mask]:
     """Cubes of each ventricle: one face-connected piece of the label's volume inside the interior."""
     names = [name for name in VENTRICLES if name in shares]
     parts = {}
@@ -216,7 +207,7 @@ def _ventricles(shares: dict[str, NDArray[np.float64]], interior: Mask) -> dict[
     return parts
 
 
-def _connected_part(share: NDArray[np.float64], target: int) -> Mask:
+def _connected_part(share: Floats, target: int) -> Mask:
     """The largest piece of the fullest cubes, with a number of cubes as near to `target` as possible."""
     part = np.zeros(share.shape, bool)
     if target == 0 or not share.any():

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mpitled.mesh import CORNERS
+from mpitled.mesh import CORNERS, Floats, Ints
 from mpitled.meshing.spacing import Spacing
 
 _SAMPLES = 8  # points per direction in a cell that the seed's surface cuts
@@ -14,7 +13,7 @@ _SLIVER = 0.5  # a cut cell with a smaller share outside the seed is merged into
 _GAUSS = CORNERS / np.sqrt(3.0)  # exact to degree 3 in each coordinate: volume and first moments of trilinear cells
 
 
-def subdivide(cells: NDArray[np.float64], cuts: NDArray[np.int64]) -> NDArray[np.float64]:
+def subdivide(cells: Floats, cuts: Ints) -> Floats:
     """Corners (sum of products of cuts, 8, 3) of hexahedra (n, 8, 3) cut in `cuts` (n, 3) parts along their axes.
 
     A part of a trilinear cell is the trilinear cell of its own corners, so the parts fill the cell exactly.
@@ -29,7 +28,7 @@ def subdivide(cells: NDArray[np.float64], cuts: NDArray[np.int64]) -> NDArray[np
     return np.stack(corners, axis=1)
 
 
-def volumes_and_centroids(cells: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def volumes_and_centroids(cells: Floats) -> tuple[Floats, Floats]:
     """Volumes (n,), m^3, and centroids (n, 3), m, of trilinear hexahedra with corners (n, 8, 3), exact to round-off."""
     volumes, moments = np.zeros(len(cells)), np.zeros((len(cells), 3))
     for point in _GAUSS:
@@ -41,12 +40,12 @@ def volumes_and_centroids(cells: NDArray[np.float64]) -> tuple[NDArray[np.float6
     return volumes, moments / volumes[:, None]
 
 
-def trilinear(cells: NDArray[np.float64], local: NDArray[np.float64]) -> NDArray[np.float64]:
+def trilinear(cells: Floats, local: Floats) -> Floats:
     """Points (n, 3) of hexahedra (n, 8, 3) at local coordinates (n, 3) in [-1, 1]^3 (paper, eq. 4.4)."""
     return _weighted((1 + CORNERS * local[:, None, :]).prod(axis=2) / 8, cells)
 
 
-def _weighted(weights: NDArray[np.float64], cells: NDArray[np.float64]) -> NDArray[np.float64]:
+def _weighted(weights: Floats, cells: Floats) -> Floats:
     """Sums (n, 3) over the corners of hexahedra (n, 8, 3) with weights (n, 8), or with weights (8,) for all cells.
 
     The sum runs corner by corner. The last bit of a BLAS product may differ between machines and would decide where
@@ -58,14 +57,12 @@ def _weighted(weights: NDArray[np.float64], cells: NDArray[np.float64]) -> NDArr
     return np.asarray(total)
 
 
-def edge_lengths(cells: NDArray[np.float64]) -> NDArray[np.float64]:
+def edge_lengths(cells: Floats) -> Floats:
     """Lengths (n, 3), m, of hexahedra (n, 8, 3) along their three axes, through the centre."""
     return np.linalg.norm(np.stack([_weighted(axis, cells) for axis in CORNERS.T / 4], axis=1), axis=2)
 
 
-def cut(
-    cells: NDArray[np.float64], spacing: Spacing, per_spacing: float, rng: np.random.Generator
-) -> NDArray[np.float64]:
+def cut(cells: Floats, spacing: Spacing, per_spacing: float, rng: np.random.Generator) -> Floats:
     """Parts (m, 8, 3) of hexahedra (n, 8, 3), about `per_spacing` times smaller than the local node spacing.
 
     Hexahedra over which the spacing changes much are halved first. A hexahedron is then cut in k or k + 1 parts along
@@ -84,7 +81,7 @@ def cut(
     return np.concatenate(done)
 
 
-def _random_cuts(ratio: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.int64]:
+def _random_cuts(ratio: Floats, rng: np.random.Generator) -> Ints:
     """Numbers of parts (n, 3) along the axes; the mean of their product is the product of the ratios (n, 3)."""
     low = np.maximum(np.floor(ratio), 1).astype(np.int64)
     # The axis that is furthest below its ratio comes first; noise breaks ties at random.
@@ -99,8 +96,8 @@ def _random_cuts(ratio: NDArray[np.float64], rng: np.random.Generator) -> NDArra
 
 
 def outside_seed(
-    cells: NDArray[np.float64], volumes: NDArray[np.float64], centroids: NDArray[np.float64], spacing: Spacing
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], float]:
+    cells: Floats, volumes: Floats, centroids: Floats, spacing: Spacing
+) -> tuple[Floats, Floats, Ints, float]:
     """Volumes, centroids and rows of the cells (n, 8, 3) outside the seed, and the sampled volume, m^3.
 
     Cells that the sphere cuts are sampled. Slivers are merged into the nearest point. The sampling error of the total

@@ -15,11 +15,12 @@ from scipy import ndimage
 
 from mpitled import resources
 from mpitled.errors import InputError
+from mpitled.mesh import Bools, Floats
 
 if TYPE_CHECKING:
     from mpitled import deck
 
-Mask = NDArray[np.bool_]  # (nz, ny, nx), so that x runs fastest in memory and in all numbers
+Mask = Bools  # (nz, ny, nx), so that x runs fastest in memory and in all numbers
 
 _METRES = {"mm": 1e-3, "unknown": 1e-3, "meter": 1.0, "micron": 1e-6}
 #: Image formats that are read; other formats of nibabel may refer to further files.
@@ -37,9 +38,9 @@ class Image:
 
     path: Path
     labels: NDArray[np.int32]  # (nz, ny, nx)
-    origin: NDArray[np.float64]  # (3,), m: the first voxel's lowest corner
-    voxel: NDArray[np.float64]  # (3,), m: its edges along x, y, z
-    to_world: NDArray[np.float64]  # (3, 4), m: from the file's voxel indices (i, j, k, 1) to the world
+    origin: Floats  # (3,), m: the first voxel's lowest corner
+    voxel: Floats  # (3,), m: its edges along x, y, z
+    to_world: Floats  # (3, 4), m: from the file's voxel indices (i, j, k, 1) to the world
     placed: bool  # whether the header gives the position of the voxels in the world
 
 

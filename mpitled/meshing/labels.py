@@ -7,11 +7,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from mpitled.errors import InputError
-from mpitled.mesh import Mesh, hexahedral_mesh
+from mpitled.mesh import Floats, Mesh, hexahedral_mesh
 from mpitled.meshing.cloud import mesh_with_cloud
 from mpitled.meshing.head import Grid, Head, voxelise
 from mpitled.meshing.label_image import VENTRICLES, Mask, largest_piece, piece_at
@@ -49,7 +48,7 @@ def mesh_labels(
     return replace(mesh, cell_sets=cell_sets, remarks=head.remarks, figures=head.figures | mesh.figures)
 
 
-def _void(head: Head, radius: float, centre: NDArray[np.float64], needed: float) -> Mask:
+def _void(head: Head, radius: float, centre: Floats, needed: float) -> Mask:
     """Cubes of tissue within the radius of the tumour's centre that the cloud replaces: one piece around the centre.
 
     No cube with a node on the skull is among them, and the rest of the solid is one piece. InputError if the centre is
@@ -105,7 +104,7 @@ def _void(head: Head, radius: float, centre: NDArray[np.float64], needed: float)
     )
 
 
-def _voxel_hint(head: Head, centre: NDArray[np.float64]) -> str:
+def _voxel_hint(head: Head, centre: Floats) -> str:
     """A hint if the deck's numbers for the centre (3,), m, taken as voxel indices, lie in the solid; else ""."""
     meant = head.to_world @ np.append(1e3 * centre, 1.0)
     cube = head.grid.index(meant)
@@ -114,7 +113,7 @@ def _voxel_hint(head: Head, centre: NDArray[np.float64]) -> str:
     return f"it looks like voxels: in mm it is {format_position(meant).removesuffix(' mm')}"
 
 
-def _alternative(grid: Grid, replaceable: Mask, centre: NDArray[np.float64], needed: float) -> str:
+def _alternative(grid: Grid, replaceable: Mask, centre: Floats, needed: float) -> str:
     """In words, the position nearest to the centre with only replaceable cubes within `needed`, m."""
     # The transform gives distances between centres of cubes; a point may be half a diagonal nearer to a corner.
     far = grid.size * (ndimage.distance_transform_edt(replaceable) - 3**0.5 / 2)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mpitled.mesh import grid_points, structured_hexahedra
+from mpitled.mesh import Bools, Floats, Ints, grid_points, structured_hexahedra
 from mpitled.meshing.faces import boundary_faces, unshared
 
 # Half the core's width over the radius, and the bulge of the core's sides towards the circle or sphere. Both come from
@@ -21,11 +20,11 @@ class OGrid:
     are straight. Nodes are the core's grid, x fastest, then one shell after the other.
     """
 
-    points: NDArray[np.float64]  # (n_nodes, d)
-    cells: NDArray[np.int64]  # (n_cells, 2^d), in VTK's order
-    surface: NDArray[np.int64]  # nodes on the sphere, ascending
-    cube: NDArray[np.float64]  # (n_surface, d), the surface nodes on the cube [-1, 1]^d before the mapping
-    faces: NDArray[np.int64]  # (n_faces, 2^(d-1)) rows of `surface`, anticlockwise seen from outside
+    points: Floats  # (n_nodes, d)
+    cells: Ints  # (n_cells, 2^d), in VTK's order
+    surface: Ints  # nodes on the sphere, ascending
+    cube: Floats  # (n_surface, d), the surface nodes on the cube [-1, 1]^d before the mapping
+    faces: Ints  # (n_faces, 2^(d-1)) rows of `surface`, anticlockwise seen from outside
 
     def __init__(
         self, shape: tuple[int, ...], radius: float, element_size: float, outermost: float = 1.0, lines: float = 1.0
@@ -71,24 +70,24 @@ class OGrid:
         self._radius = np.concatenate([_CORE * middle, _CORE + (1 - _CORE) * shell])
         self._outermost = np.arange(len(self.cells)) >= len(self.cells) - len(self.faces)
 
-    def core(self, share: float) -> NDArray[np.bool_]:
+    def core(self, share: float) -> Bools:
         """Cells (n_cells,) whose middle lies within that share of the radius, never those of the outermost shell."""
         return (self._radius <= share) & ~self._outermost
 
 
-def graded(n: int, smallest: float, both_ends: bool = False) -> NDArray[np.float64]:
+def graded(n: int, smallest: float, both_ends: bool = False) -> Floats:
     """Ends (n + 1,) of n parts of [0, 1]; their lengths fall to `smallest` times the mean at 1, or at both ends.
 
     The ends come from a smooth map, so errors fall with n as with equal parts.
     """
     s, cycles = np.arange(n + 1) / n, 2 if both_ends else 1
     shift = (1 - smallest) * np.sin(cycles * np.pi * s) / (cycles * np.pi)
-    ends: NDArray[np.float64] = s - shift if both_ends else s + shift
+    ends: Floats = s - shift if both_ends else s + shift
     ends[-1] = 1.0
     return ends
 
 
-def _crowded(grid: NDArray[np.float64], smallest: float) -> NDArray[np.float64]:
+def _crowded(grid: Floats, smallest: float) -> Floats:
     """Equidistant grid points (n, d) in [-1, 1]^d, moved towards the coordinates 1/2 and 1: see `graded`."""
     if smallest == 1:
         return grid
@@ -99,7 +98,7 @@ def _crowded(grid: NDArray[np.float64], smallest: float) -> NDArray[np.float64]:
     return np.sign(grid) * np.where(exact, w, np.where(w < 0.5, inner, outer))
 
 
-def on_sphere(cube: NDArray[np.float64]) -> NDArray[np.float64]:
+def on_sphere(cube: Floats) -> Floats:
     """Unit vectors (n, d) of points (n, d) on the cube's surface: the equiangular map of the cubed sphere.
 
     Ronchi, Iacono and Paolucci 1996, J. Comput. Phys. 124. Zero vectors stay zero.
@@ -108,13 +107,13 @@ def on_sphere(cube: NDArray[np.float64]) -> NDArray[np.float64]:
     return slopes / np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1e-300)
 
 
-def _boundary_edges(quads: NDArray[np.int64]) -> NDArray[np.int64]:
+def _boundary_edges(quads: Ints) -> Ints:
     """Edges (n, 2) that belong to one of the quadrilaterals (n, 4) only, in their sense of rotation."""
     edges = np.stack([quads, np.roll(quads, -1, axis=1)], axis=2).reshape(-1, 2)
     return edges[unshared(edges)]
 
 
-def shell_cells(nodes: NDArray[np.int64], faces: NDArray[np.int64]) -> NDArray[np.int64]:
+def shell_cells(nodes: Ints, faces: Ints) -> Ints:
     """Hexahedra (n, 8) between successive layers of nodes (n_layers + 1, m), over faces (k, 4) that index into m."""
     return np.concatenate([nodes[:-1][:, faces], nodes[1:][:, faces]], axis=2).reshape(-1, 8)
 

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpitled.errors import InputError
-from mpitled.mesh import Mesh, check_size, hexahedral_mesh
+from mpitled.mesh import Bools, Floats, Ints, Mesh, check_size, hexahedral_mesh
 from mpitled.meshing.cloud import mesh_with_cloud, near_centre
 from mpitled.meshing.o_grid import OGrid, graded, on_sphere, shell_cells, whole_number
 from mpitled.meshing.placement import format_position
@@ -102,10 +101,10 @@ def _element_size(phantom: deck.Cylinder | deck.Ellipsoid, cloud: deck.Cloud) ->
 
 def _filled(
     which: str,
-    core: NDArray[np.bool_],
-    points: NDArray[np.float64],
-    hexahedra: NDArray[np.int64],
-    node_sets: dict[str, NDArray[np.int64]],
+    core: Bools,
+    points: Floats,
+    hexahedra: Ints,
+    node_sets: dict[str, Ints],
     cloud: deck.Cloud,
     tumour: deck.Tumour | None,
     element_size: float,
@@ -121,7 +120,7 @@ def _filled(
     return mesh_with_cloud(points, hexahedra, core, node_sets, cloud, tumour, element_size, spheres)
 
 
-def _check_room(tumour: deck.Tumour, axes: NDArray[np.float64], element_size: float) -> None:
+def _check_room(tumour: deck.Tumour, axes: Floats, element_size: float) -> None:
     """InputError unless the seed, with an element's size around it, lies inside the ellipsoid."""
     centre, room = np.asarray(tumour.centre), tumour.seed_radius + element_size
     if room >= axes.min() or np.linalg.norm(centre / (axes - room)) > 1:
@@ -131,13 +130,7 @@ def _check_room(tumour: deck.Tumour, axes: NDArray[np.float64], element_size: fl
         )
 
 
-def _fitted(
-    outer: NDArray[np.float64],
-    o_grid: OGrid,
-    node_sets: dict[str, NDArray[np.int64]],
-    tumour: deck.Tumour,
-    element_size: float,
-) -> Mesh:
+def _fitted(outer: Floats, o_grid: OGrid, node_sets: dict[str, Ints], tumour: deck.Tumour, element_size: float) -> Mesh:
     """Shells from the seed's surface (node set tumour) to the ellipsoid's surface nodes `outer` (n, 3).
 
     The width of cells grows with the distance to the centre. Shells are _THICK times as thick as their cells are wide,
@@ -167,13 +160,7 @@ def _fitted(
     return hexahedral_mesh(points.reshape(-1, 3), hexahedra, node_sets)
 
 
-def _moved(
-    points: NDArray[np.float64],
-    hexahedra: NDArray[np.int64],
-    node_sets: dict[str, NDArray[np.int64]],
-    axes: NDArray[np.float64],
-    centre: NDArray[np.float64],
-) -> Mesh:
+def _moved(points: Floats, hexahedra: Ints, node_sets: dict[str, Ints], axes: Floats, centre: Floats) -> Mesh:
     """A mesh that does not follow the seed's surface: one hexahedron is the cavity, its nodes are the set tumour.
 
     A shift that fades towards the surface moves the centre of this hexahedron to the tumour's centre.

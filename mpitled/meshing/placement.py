@@ -5,16 +5,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpitled.errors import InputError
+from mpitled.mesh import Bools, Floats, Ints
 from mpitled.meshing.faces import boundary_faces
 
 if TYPE_CHECKING:
     from mpitled import deck
 
 
-def format_position(position: NDArray[np.float64]) -> str:
+def format_position(position: Floats) -> str:
     """A position (3,), m, in millimetres, as the user wrote it in the deck."""
     return "(" + ", ".join(f"{1e3 * x:g}" for x in position) + ") mm"
 
@@ -24,7 +24,7 @@ def format_length(metres: float) -> str:
     return f"{round(1e3 * metres, 2):.3g} mm"
 
 
-def unit_hint(position: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]) -> str:
+def unit_hint(position: Floats, low: Floats, high: Floats) -> str:
     """A hint if the deck's numbers for a position (3,), m, taken as metres, lie in the box low to high, m; else ""."""
     meant = 1e3 * position
     if not 0 < np.abs(position).max() < 1e-3 or not ((low <= meant) & (meant <= high)).all():
@@ -32,12 +32,12 @@ def unit_hint(position: NDArray[np.float64], low: NDArray[np.float64], high: NDA
     return f"it looks like metres: in mm it is {format_position(meant).removesuffix(' mm')}"
 
 
-def in_sphere(points: NDArray[np.float64], sphere: deck.Sphere) -> NDArray[np.bool_]:
+def in_sphere(points: Floats, sphere: deck.Sphere) -> Bools:
     """Which of the points (n, 3), m, lie in the sphere."""
     return np.asarray(np.linalg.norm(points - np.asarray(sphere.centre), axis=1) <= sphere.radius)
 
 
-def check_inside(points: NDArray[np.float64], hexahedra: NDArray[np.int64], tumour: deck.Tumour) -> None:
+def check_inside(points: Floats, hexahedra: Ints, tumour: deck.Tumour) -> None:
     """InputError unless the tumour's centre lies inside the body of the hexahedra (n, 8)."""
     centre = np.asarray(tumour.centre, float)
     inside, distance = _locate(points[boundary_faces(hexahedra)], centre)
@@ -50,13 +50,7 @@ def check_inside(points: NDArray[np.float64], hexahedra: NDArray[np.int64], tumo
         )
 
 
-def check_seed_fits(
-    points: NDArray[np.float64],
-    boundary: NDArray[np.int64],
-    tumour: deck.Tumour,
-    element_size: float,
-    radius: float,
-) -> None:
+def check_seed_fits(points: Floats, boundary: Ints, tumour: deck.Tumour, element_size: float, radius: float) -> None:
     """InputError unless the seed lies inside the cloud's boundary (n, 4), with cloud of an element's size around it.
 
     `radius` (m) is cloud.radius. Hexahedra with their centre within it are replaced if they may be replaced.
@@ -82,7 +76,7 @@ def check_seed_fits(
     raise InputError(f"{message}; {hint}" if hint else message)
 
 
-def _locate(surface: NDArray[np.float64], point: NDArray[np.float64]) -> tuple[bool, float]:
+def _locate(surface: Floats, point: Floats) -> tuple[bool, float]:
     """Whether a point (3,) lies inside a closed surface of quadrilaterals (n, 4, 3), and its distance from it, m."""
     quads = surface - point
     # Solid angles of a closed surface sum to 4 pi for a point inside, to 0 outside (van Oosterom and Strackee 1983).

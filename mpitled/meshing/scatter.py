@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mpitled.mesh import Bools, Floats, Ints
 from mpitled.meshing.integration_cells import cut, trilinear, volumes_and_centroids
 from mpitled.meshing.spacing import Spacing
 
@@ -19,13 +19,7 @@ _SWEEPS = 3  # of Lloyd; more change nothing, because nodes move from candidate 
 _ROUNDS = 24  # of dart throwing, approximately
 
 
-def scatter(
-    cells: NDArray[np.float64],
-    spacing: Spacing,
-    occupied: NDArray[np.float64],
-    irregularity: float,
-    rng: np.random.Generator,
-) -> NDArray[np.float64]:
+def scatter(cells: Floats, spacing: Spacing, occupied: Floats, irregularity: float, rng: np.random.Generator) -> Floats:
     """Irregular nodes (n, 3), one per cubed spacing, in hexahedra (m, 8, 3) around the `occupied` points (k, 3).
 
     Dart throwing finds points with a minimum distance and without holes, Lloyd sweeps even them out, and a random shift
@@ -41,14 +35,14 @@ def scatter(
     return candidates[np.sort(_shift(candidates, local, nodes, occupied, irregularity, rng))]
 
 
-def fibonacci_sphere(n: int) -> NDArray[np.float64]:
+def fibonacci_sphere(n: int) -> Floats:
     """Unit vectors (n, 3) of the Fibonacci lattice, whose points have equal areas (Gonzalez 2010)."""
     i = np.arange(n) + 0.5
     polar, azimuth = np.arccos(1 - 2 * i / n), np.pi * (1 + 5**0.5) * i
     return np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=1)
 
 
-def _candidates(cells: NDArray[np.float64], spacing: Spacing, rng: np.random.Generator) -> NDArray[np.float64]:
+def _candidates(cells: Floats, spacing: Spacing, rng: np.random.Generator) -> Floats:
     """Random points (n, 3) outside the seed, about _CANDIDATES per cubed spacing."""
     parts = cut(cells, spacing, 1.0, rng)
     volumes, centroids = volumes_and_centroids(parts)
@@ -61,12 +55,7 @@ def _candidates(cells: NDArray[np.float64], spacing: Spacing, rng: np.random.Gen
     return points[spacing.distance(points) > spacing.radius]
 
 
-def _throw_darts(
-    candidates: NDArray[np.float64],
-    min_distance: NDArray[np.float64],
-    occupied: NDArray[np.float64],
-    rng: np.random.Generator,
-) -> NDArray[np.int64]:
+def _throw_darts(candidates: Floats, min_distance: Floats, occupied: Floats, rng: np.random.Generator) -> Ints:
     """A maximal set of candidates that keep their `min_distance` (n,) from each other and from the occupied points.
 
     Poisson-disc sampling (Cook 1986), in rounds of many darts at once.
@@ -81,12 +70,7 @@ def _throw_darts(
     return np.concatenate(chosen) if chosen else alive
 
 
-def _separate(
-    candidates: NDArray[np.float64],
-    min_distance: NDArray[np.float64],
-    nodes: NDArray[np.int64],
-    occupied: NDArray[np.float64],
-) -> NDArray[np.int64]:
+def _separate(candidates: Floats, min_distance: Floats, nodes: Ints, occupied: Floats) -> Ints:
     """Nodes without those too near to an occupied point or to an earlier node."""
     nodes = nodes[_clear(candidates[nodes], min_distance[nodes], occupied)]
     while len(nodes) > 1:
@@ -101,12 +85,7 @@ def _separate(
     return nodes
 
 
-def _lloyd(
-    candidates: NDArray[np.float64],
-    local: NDArray[np.float64],
-    nodes: NDArray[np.int64],
-    occupied: NDArray[np.float64],
-) -> NDArray[np.int64]:
+def _lloyd(candidates: Floats, local: Floats, nodes: Ints, occupied: Floats) -> Ints:
     """Move each node to the candidate of its Voronoi cell next to the cell's centroid (Lloyd 1982)."""
     owner = cKDTree(np.concatenate([candidates[nodes], occupied])).query(candidates)[1]
     owned = owner < len(nodes)
@@ -123,13 +102,8 @@ def _lloyd(
 
 
 def _shift(
-    candidates: NDArray[np.float64],
-    local: NDArray[np.float64],
-    nodes: NDArray[np.int64],
-    occupied: NDArray[np.float64],
-    irregularity: float,
-    rng: np.random.Generator,
-) -> NDArray[np.int64]:
+    candidates: Floats, local: Floats, nodes: Ints, occupied: Floats, irregularity: float, rng: np.random.Generator
+) -> Ints:
     """Move nodes at random by up to `irregularity` spacings, unless they come too near to another node."""
     direction = rng.normal(size=(len(nodes), 3))
     length = irregularity * local[nodes] * rng.random(len(nodes)) ** (1 / 3) / np.linalg.norm(direction, axis=1)
@@ -148,9 +122,7 @@ def _shift(
         shifted = np.where(back, nodes, shifted)
 
 
-def _clear(
-    points: NDArray[np.float64], min_distance: NDArray[np.float64], others: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def _clear(points: Floats, min_distance: Floats, others: Floats) -> Bools:
     """Which of the points (n, 3) have their own `min_distance` (n,) from all others (m, 3)."""
     if len(others) == 0 or len(points) == 0:
         return np.ones(len(points), bool)

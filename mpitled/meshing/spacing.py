@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mpitled.mesh import Floats, Ints
 from mpitled.meshing.faces import area_vectors
 
 # Growth of the spacing with the distance from faces between parts. With 0.1 a soft sphere's error is 1.3 to 1.5 times
@@ -25,30 +25,30 @@ class Spacing:
 
     largest: float  # m
     growth: float = 0.0
-    centre: NDArray[np.float64] | None = None  # of the seed, m; None without a seed
+    centre: Floats | None = None  # of the seed, m; None without a seed
     radius: float = 0.0  # of the seed, m
     at_surface: float = 0.0  # m
     # Centres (n, 3), m, of faces between parts, and their sizes (n,), m; the spacing near a face is at most its size.
-    faces: tuple[cKDTree, NDArray[np.float64]] | None = None
+    faces: tuple[cKDTree, Floats] | None = None
 
     @property
     def seed_volume(self) -> float:
         """Volume of the seed, m^3."""
         return 4 / 3 * np.pi * self.radius**3
 
-    def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def distance(self, points: Floats) -> Floats:
         """Distance (n,) of points (n, 3) to the seed's centre, m; infinite without a seed."""
         if self.centre is None:
             return np.full(len(points), np.inf)
         return np.linalg.norm(points - self.centre, axis=1)
 
-    def at_distance(self, distance: NDArray[np.float64]) -> NDArray[np.float64]:
+    def at_distance(self, distance: Floats) -> Floats:
         """Spacing (n,), m, at distances (n,), m, to the seed's centre."""
         if self.centre is None:
             return np.full(len(distance), self.largest)
         return np.minimum(self.largest, self.at_surface + self.growth * np.maximum(distance - self.radius, 0.0))
 
-    def __call__(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def __call__(self, points: Floats) -> Floats:
         """Spacing (n,), m, at points (n, 3), m."""
         spacing = self.at_distance(self.distance(points))
         if self.faces is None:
@@ -66,7 +66,7 @@ class Spacing:
         density = 4 * np.pi * r**2 / self.at_distance(r) ** 3
         return float(((density[1:] + density[:-1]) / 2 * np.diff(r)).sum())
 
-    def refined(self, points: NDArray[np.float64], boundaries: list[NDArray[np.int64]]) -> Spacing:
+    def refined(self, points: Floats, boundaries: list[Ints]) -> Spacing:
         """This spacing, but at most the size of the faces (n, 4) that two of the parts' boundaries share."""
         faces = np.concatenate(boundaries)
         _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)

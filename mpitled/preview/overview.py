@@ -18,7 +18,7 @@ from mpitled.meshing.placement import format_length, format_position
 from mpitled.model import build as model_build
 from mpitled.model.loading import sphere_radius
 from mpitled.preview import forecast
-from mpitled.readers import meshes
+from mpitled.readers import meshes, solids
 from mpitled.readers.meshfile import MeshFile
 
 #: A tumour this near to the plane between left and right is in the middle, m.
@@ -177,9 +177,9 @@ def _file_checks(file: MeshFile) -> Iterator[str]:
         said = checks.scene_remarks(mesh.points, mesh.hexahedra, none, mesh.n_fe_nodes, dofs)
         yield from said if len(dofs) else [remark for remark in said if "rigid" not in remark]
     else:
-        meshes.check_solids(file)
+        solids.check_solids(file)
         yield from file.remarks
-        yield from meshes.check_cloud(file)
+        yield from solids.check_cloud(file)
         yield (
             f"warning: {file.path}: has {'no hexahedra' if 'hexahedron' not in kinds else 'more than hexahedra'}; it "
             "may be mesh.efg" + (", and mesh.fe if mesh.dropped names the rest" if "hexahedron" in kinds else "")
