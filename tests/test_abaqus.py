@@ -86,10 +86,7 @@ def test_a_deck_that_is_cut_short_is_recognised(tmp_path):
         read(tmp_path, ASSEMBLY[: ASSEMBLY.index("*Assembly")])
     assert [
         remark.partition("deck.inp: ")[2] for remark in read(tmp_path, FLAT + cut).remarks if "warning" in remark
-    ] == [
-        "part Cube has no *INSTANCE and is left out",
-        "the file ends within *PART Cube: is it cut short?",
-    ]
+    ] == ["part Cube has no *INSTANCE and is left out", "the file ends within *PART Cube: is it cut short?"]
 
 
 WRITTEN = {

@@ -9,7 +9,7 @@ import numpy as np
 
 from mpitled.errors import InputError
 from mpitled.mesh import Bools, Floats, Ints, Mesh, check_size, grid_points, hexahedral_mesh, structured_hexahedra
-from mpitled.meshing.cloud import mesh_with_cloud, near_centre
+from mpitled.meshing.cloud import build_cloud, near_centre
 from mpitled.meshing.o_grid import OGrid, shell_cells, whole_number
 from mpitled.meshing.placement import format_position
 
@@ -65,7 +65,7 @@ def block_mesh(
     elif tumour is not None:
         core = near_centre(corner + local, hexahedra, tumour, cloud.radius)
     element_size = float((size.prod() / len(hexahedra)) ** (1 / 3))
-    return mesh_with_cloud(corner + local, hexahedra, core, node_sets, cloud, tumour, element_size, spheres)
+    return build_cloud(corner + local, hexahedra, core, node_sets, cloud, tumour, element_size, spheres).mesh
 
 
 def _inner(shape: Ints, share: float) -> Bools:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -27,33 +26,18 @@ _BYTES = 2000
 _REMEDY = "ask for fewer"
 
 
-@dataclass(frozen=True, slots=True)
-class CloudMesh:
-    """The hexahedra that remain and the cloud that replaces the others; FE nodes first, then EFG nodes."""
+class CloudMesh(NamedTuple):
+    """The hexahedra that remain with the cloud that replaces the others, and the spacing of the cloud's nodes."""
 
-    points: Floats  # (n_nodes, 3), m
-    n_fe_nodes: int
-    hexahedra: Ints  # (n_hexahedra, 8), the remaining rows, renumbered
-    new_numbers: Ints  # (n_points_given,), new number of each given node; -1 if it was removed
-    integration_points: Floats  # (n_integration, 3), m
-    integration_volumes: Floats  # (n_integration,), m^3
-    interface: Ints  # FE nodes on the void's boundary, ascending
-    seed_nodes: Ints  # EFG nodes on the seed's surface, ascending
-    surface_areas: Floats  # (n_nodes, 3), m^2: see `Mesh`
-    parts: tuple[Part, ...]  # see `Mesh`
+    mesh: Mesh
     spacing: Spacing
-    figures: dict[str, float]
-
-    def renumber(self, nodes: Ints) -> Ints:
-        """New numbers, ascending, of those of the given mesh's nodes that remain."""
-        new = self.new_numbers[nodes]
-        return np.unique(new[new >= 0])
 
 
 def build_cloud(
     points: Floats,
     hexahedra: Ints,
     replaced: Bools,
+    node_sets: dict[str, Ints],
     cloud: deck.Cloud,
     tumour: deck.Tumour | None,
     element_size: float,
@@ -65,7 +49,8 @@ def build_cloud(
     the void's volume less the seed's. Nodes of the outer surface that no remaining hexahedron uses become EFG nodes, so
     a cloud without hexahedra ends on the given surface. Nodes of faces between replaced hexahedra inside and outside
     one of the spheres become EFG nodes too: the cloud has two parts there and is as fine as these faces. `element_size`
-    (m) is the largest spacing unless the deck gives one. The same arguments give the same bits.
+    (m) is the largest spacing unless the deck gives one. The same arguments give the same bits. The mesh has the given
+    node sets without the nodes that are gone, and the sets interface and, with a tumour, tumour: the seed's surface.
 
     Raises InputError if nothing is replaced, if no node fits, or if the seed does not lie inside the void.
     """
@@ -125,48 +110,23 @@ def build_cloud(
             part_areas[: len(hull)] = _surface_areas(points, pieces[p], on_boundary)[hull]
         order = np.argsort(nodes)
         parts.append(Part(names[p], np.flatnonzero(part_of_point == p), nodes[order], part_areas[order]))
-    return CloudMesh(
+    node_sets = {name: np.sort(new_numbers[nodes]) for name, nodes in node_sets.items()}
+    node_sets = {name: nodes[nodes >= 0] for name, nodes in node_sets.items()}
+    node_sets["interface"] = new_numbers[on_boundary & in_fe]
+    if tumour is not None:
+        node_sets["tumour"] = seed_nodes
+    mesh = numbered_mesh(
         points=new_points,
         n_fe_nodes=n_fe_nodes,
         hexahedra=new_numbers[remaining],
-        new_numbers=new_numbers,
         integration_points=centroids,
         integration_volumes=volumes,
-        interface=new_numbers[on_boundary & in_fe],
-        seed_nodes=seed_nodes,
+        node_sets=node_sets,
+        figures={"void_volume_m3": void_volume, "seed_volume_m3": spacing.seed_volume, **figures},
         surface_areas=areas,
         parts=tuple(parts),
-        spacing=spacing,
-        figures={"void_volume_m3": void_volume, "seed_volume_m3": spacing.seed_volume, **figures},
     )
-
-
-def mesh_with_cloud(
-    points: Floats,
-    hexahedra: Ints,
-    replaced: Bools,
-    node_sets: dict[str, Ints],
-    cloud: deck.Cloud,
-    tumour: deck.Tumour | None,
-    element_size: float,
-    spheres: Sequence[deck.Sphere] = (),
-) -> Mesh:
-    """The mesh with a cloud in place of the chosen hexahedra, and the sets interface and tumour; see `build_cloud`."""
-    built = build_cloud(points, hexahedra, replaced, cloud, tumour, element_size, spheres)
-    node_sets = {name: built.renumber(nodes) for name, nodes in node_sets.items()} | {"interface": built.interface}
-    if tumour is not None:
-        node_sets["tumour"] = built.seed_nodes
-    return numbered_mesh(
-        points=built.points,
-        n_fe_nodes=built.n_fe_nodes,
-        hexahedra=built.hexahedra,
-        integration_points=built.integration_points,
-        integration_volumes=built.integration_volumes,
-        node_sets=node_sets,
-        figures=built.figures,
-        surface_areas=built.surface_areas,
-        parts=built.parts,
-    )
+    return CloudMesh(mesh, spacing)
 
 
 def near_centre(points: Floats, hexahedra: Ints, tumour: deck.Tumour, radius: float) -> Bools:

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from mpitled.errors import InputError
 from mpitled.mesh import Floats, Mesh, hexahedral_mesh
-from mpitled.meshing.cloud import mesh_with_cloud
+from mpitled.meshing.cloud import build_cloud
 from mpitled.meshing.head import Grid, Head, voxelise
 from mpitled.meshing.label_image import VENTRICLES, Mask, largest_piece, piece_at
 from mpitled.meshing.placement import format_length, format_position, unit_hint
@@ -41,7 +41,7 @@ def mesh_labels(
     else:
         void = _void(head, cloud.radius, np.asarray(tumour.centre, float), tumour.seed_radius + head.grid.size)
         remaining = head.solid & ~void
-        mesh = mesh_with_cloud(points, hexahedra, void[head.solid], node_sets, cloud, tumour, head.grid.size, spheres)
+        mesh = build_cloud(points, hexahedra, void[head.solid], node_sets, cloud, tumour, head.grid.size, spheres).mesh
     cell_sets = {name: np.flatnonzero(mask[remaining]) for name, mask in head.parts.items()}
     cell_sets["tissue"] = np.append(cell_sets["tissue"], mesh.cell_sets["cloud"])
     cell_sets["all"] = mesh.cell_sets["all"]

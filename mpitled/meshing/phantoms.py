@@ -9,7 +9,7 @@ import numpy as np
 
 from mpitled.errors import InputError
 from mpitled.mesh import Bools, Floats, Ints, Mesh, check_size, hexahedral_mesh
-from mpitled.meshing.cloud import mesh_with_cloud, near_centre
+from mpitled.meshing.cloud import build_cloud, near_centre
 from mpitled.meshing.o_grid import OGrid, graded, on_sphere, shell_cells, whole_number
 from mpitled.meshing.placement import format_position
 
@@ -117,7 +117,7 @@ def _filled(
         core = np.ones(len(hexahedra), bool)
     elif tumour is not None:
         core = near_centre(points, hexahedra, tumour, cloud.radius)
-    return mesh_with_cloud(points, hexahedra, core, node_sets, cloud, tumour, element_size, spheres)
+    return build_cloud(points, hexahedra, core, node_sets, cloud, tumour, element_size, spheres).mesh
 
 
 def _check_room(tumour: deck.Tumour, axes: Floats, element_size: float) -> None:
