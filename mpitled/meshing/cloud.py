@@ -103,13 +103,10 @@ def build_cloud(
     parts = []
     for p in np.unique(part_of_point):
         hull = np.unique(faces[p])
-        seed_of_part = seed_nodes[(touched == p).any(axis=1)]
-        nodes = np.concatenate([new_numbers[hull], seed_of_part, np.arange(ends[p], ends[p + 1])])
-        part_areas = np.zeros((len(nodes), 3))
-        if len(pieces) > 1:
-            part_areas[: len(hull)] = _surface_areas(points, pieces[p], on_boundary)[hull]
-        order = np.argsort(nodes)
-        parts.append(Part(names[p], np.flatnonzero(part_of_point == p), nodes[order], part_areas[order]))
+        nodes = [new_numbers[hull], seed_nodes[(touched == p).any(axis=1)], np.arange(ends[p], ends[p + 1])]
+        # A single part has no faces to other parts.
+        hull_areas = _surface_areas(points, pieces[p], on_boundary)[hull] if len(pieces) > 1 else np.zeros((0, 3))
+        parts.append(_part(names[p], np.flatnonzero(part_of_point == p), np.concatenate(nodes), hull_areas))
     node_sets = {name: np.sort(new_numbers[nodes]) for name, nodes in node_sets.items()}
     node_sets = {name: nodes[nodes >= 0] for name, nodes in node_sets.items()}
     node_sets["interface"] = new_numbers[on_boundary & in_fe]
@@ -185,6 +182,13 @@ def _integrate(
         return volumes, centroids, part_of_point, {}
     volumes, centroids, rows, sampled = outside_seed(cells, volumes, centroids, spacing)
     return volumes, centroids, part_of_point[rows], {"integration_volume_before_rescaling_m3": sampled}
+
+
+def _part(spheres: tuple[str, ...], integration_points: Ints, nodes: Ints, areas: Floats) -> Part:
+    """A part of the cloud with its nodes in ascending order; `areas` are those of the first nodes."""
+    areas = np.concatenate([areas, np.zeros((len(nodes) - len(areas), 3))])
+    order = np.argsort(nodes)
+    return Part(spheres, integration_points, nodes[order], areas[order])
 
 
 def _surface_areas(points: Floats, hexahedra: Ints, at: Bools) -> Floats:
