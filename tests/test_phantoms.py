@@ -275,7 +275,7 @@ def test_nodes_beside_the_seed_move_as_incompressible_tissue():
 
 
 def test_a_seed_needs_room():
-    with pytest.raises(InputError, match=r"tumour.centre = \(75, 0, 8\) mm: seed and an element's size"):
+    with pytest.raises(InputError, match=r"tumour.centre = \(75, 0, 8\) mm: the seed and an element's size"):
         ellipsoid(tumour=deck.Tumour(centre=(0.075, 0.0, 0.008), volume=523.6e-9))
     with pytest.raises(InputError, match=r'cylinder.cloud = "none"'):
         cylinder(tumour=TUMOUR)
