@@ -26,7 +26,7 @@ from mpitled.deck import GEOMETRIES
 from mpitled.errors import InputError
 from mpitled.laws import Material, NeoHookean
 from mpitled.model import Model
-from mpitled.readers.meshfile import LARGEST_ID
+from mpitled.readers.meshfile import MAX_ID
 
 FE, EFG, GRID, AREAS, SCENE = "fe.inp", "efg.inp", "integration_points.csv", "surface_areas.csv", "scene.toml"
 #: Sections that the export writes anew: constraints and spheres are in the files, materials go by sets that there are.
@@ -90,7 +90,7 @@ def _check_names(path: Path, model: Model) -> None:
 def _numbers(model: Model) -> NDArray[np.int64]:
     """Numbers of the nodes in the decks: their own where no two are the same, else rows."""
     ids = model.node_ids
-    unique = len(np.unique(ids)) == len(ids) and ids.min() >= 1 and ids.max() <= LARGEST_ID
+    unique = len(np.unique(ids)) == len(ids) and ids.min() >= 1 and ids.max() <= MAX_ID
     return ids if unique else np.arange(1, len(ids) + 1)
 
 

@@ -52,11 +52,11 @@ def contents(path: Path) -> dict[str, Any]:
 
     InputError if it is none of these, or damaged. Of tables, which have no checksums, only the outlines are read.
     """
-    from mpitled.meshing import labels
+    from mpitled.meshing import label_image
 
     path = _file_of(path)
-    if labels.is_image(path):
-        return {"kind": "image", "path": str(path), **labels.contents(path)}
+    if label_image.is_image(path):
+        return {"kind": "image", "path": str(path), **label_image.contents(path)}
     if path.is_file() and (what := _elsewhere(path)):
         raise InputError(f"{path}: {what}")
     with damaged(path, "build the model anew, or run the deck again"):

@@ -1,4 +1,4 @@
-"""The geometry of a scene: what every reader and mesher makes, and what the model is built from."""
+"""The geometry of a scene: the result of every reader and mesher, and the input of the model."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ from mpitled import resources
 from mpitled.errors import InputError
 from mpitled.laws import Material
 
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
 #: Units of length of decks and files, in m.
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 #: Corners of the reference hexahedron in the Abaqus/VTK order (paper, eq. 4.4).
 CORNERS = np.array([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
-
-
-#: Memory that each hexahedron takes while a model is built, at the least: 490 to 610 in blocks and phantoms.
+#: Lower bound of the memory per hexahedron while a model is built (measured: 490 to 610 in blocks and phantoms).
 _HEXAHEDRON_BYTES = 500
 
 
@@ -34,49 +36,49 @@ class Rotation:
 
 @dataclass(frozen=True, slots=True)
 class Constraint:
-    """Nodes held (displacement 0) or moved along the loading curve, in the named directions only."""
+    """Nodes that are fixed (displacement 0) or moved along the loading curve, in the named directions only."""
 
     node_set: str
     directions: tuple[int, ...]  # of 0, 1, 2
-    #: m at full load, one for each direction, 0 where fixed; or (n_nodes,) where the set's nodes move differently
-    displacement: tuple[float | NDArray[np.float64], ...]
+    #: m at full load, one for each direction, 0 where fixed; an array (n_nodes,) where the set's nodes differ
+    displacement: tuple[float | Floats, ...]
     origin: str = ""  # file and line or key, for messages
-    rotation: Rotation | None = None  # beside the displacement
-    field: Path | None = None  # beside both: displacements at places, see `mapping`
-    field_metre: float = 1.0  # its unit of length, m
+    rotation: Rotation | None = None  # added to the displacement
+    field: Path | None = None  # added to both: a table of displacements, see `model.mapping`
+    field_metre: float = 1.0  # the table's unit of length, m
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """The cloud of one material: a body of its own, which shares the nodes of its surface with those beside it."""
+    """The cloud of one material: a separate body that shares the nodes of its surface with its neighbours."""
 
-    spheres: tuple[str, ...]  # those that it lies in
-    integration_points: NDArray[np.int64]  # ascending
-    nodes: NDArray[np.int64]  # in it and on its surface, ascending
-    areas: NDArray[np.float64]  # (nodes, 3), m^2: integral of N_a n over its surface but the seed's; 0 of an only part
+    spheres: tuple[str, ...]  # names of the spheres around it
+    integration_points: Ints  # ascending
+    nodes: Ints  # in it and on its surface, ascending
+    areas: Floats  # (nodes, 3), m^2: integral of N_a n over its surface but the seed's; 0 in a single part
 
 
 @dataclass(frozen=True, slots=True)
 class Mesh:
     """Nodes, hexahedra and integration points in metres; FE nodes first, then EFG nodes (paper, 4.1.2).
 
-    Cells are hexahedra first, then integration points: cell sets index into that list.
+    Cell sets number the hexahedra first, then the integration points.
     """
 
-    points: NDArray[np.float64]  # (n_nodes, 3), m
+    points: Floats  # (n_nodes, 3), m
     n_fe_nodes: int  # rows of `points` that hexahedra use
-    hexahedra: NDArray[np.int64]  # (n_hexahedra, 8), Abaqus/VTK order
-    integration_points: NDArray[np.float64]  # (n_integration, 3), m
-    integration_volumes: NDArray[np.float64]  # (n_integration,), m^3
-    node_sets: dict[str, NDArray[np.int64]]  # name -> ascending nodes
-    cell_sets: dict[str, NDArray[np.int64]]  # name -> ascending cells
-    node_ids: NDArray[np.int64]  # (n_nodes,), numbers in the file that the nodes came from
-    # (n_nodes, 3), m^2: integral of N_a n over the outer surface, at nodes on the cloud's boundary; None: unknown.
-    surface_areas: NDArray[np.float64] | None = None
-    parts: tuple[Part, ...] = ()  # of the cloud, where it is known
-    materials: dict[str, Material] = field(default_factory=dict)  # cell set -> material, where the file says so
-    constraints: tuple[Constraint, ...] = ()  # where the file says so
-    remarks: tuple[str, ...] = ()  # what the reader skipped, merged or repaired, a line each
+    hexahedra: Ints  # (n_hexahedra, 8), Abaqus/VTK order
+    integration_points: Floats  # (n_integration, 3), m
+    integration_volumes: Floats  # (n_integration,), m^3
+    node_sets: dict[str, Ints]  # name -> ascending nodes
+    cell_sets: dict[str, Ints]  # name -> ascending cells
+    node_ids: Ints  # (n_nodes,), numbers in the nodes' file
+    # (n_nodes, 3), m^2: integral of N_a n over the outer surface at nodes on the cloud's boundary; None if unknown.
+    surface_areas: Floats | None = None
+    parts: tuple[Part, ...] = ()  # of the cloud, if known
+    materials: dict[str, Material] = field(default_factory=dict)  # cell set -> material, from files
+    constraints: tuple[Constraint, ...] = ()  # from files
+    remarks: tuple[str, ...] = ()  # one line each: what was skipped, merged or repaired
     figures: dict[str, float] = field(default_factory=dict)  # e.g. void_volume_m3
 
     @property
@@ -89,29 +91,28 @@ class Mesh:
 
 
 def check_size(n_hexahedra: float, key: str, remedy: str = "ask for fewer") -> None:
-    """InputError if so many hexahedra, which a key of the deck asks for, are more than the machine has memory for."""
+    """InputError if the hexahedra that a key of the deck asks for exceed the machine's memory."""
     what = f"{key}: makes {n_hexahedra:.3g} hexahedra, which"
     resources.check_memory(_HEXAHEDRON_BYTES * n_hexahedra, what, remedy)
 
 
-def hexahedral_mesh(
-    points: NDArray[np.float64], hexahedra: NDArray[np.int64], node_sets: dict[str, NDArray[np.int64]]
-) -> Mesh:
+def hexahedral_mesh(points: Floats, hexahedra: Ints, node_sets: dict[str, Ints]) -> Mesh:
     """A mesh of hexahedra only."""
     return numbered_mesh(points, len(points), hexahedra, np.empty((0, 3)), np.empty(0), node_sets, {})
 
 
 def numbered_mesh(
-    points: NDArray[np.float64],
+    points: Floats,
     n_fe_nodes: int,
-    hexahedra: NDArray[np.int64],
-    integration_points: NDArray[np.float64],
-    integration_volumes: NDArray[np.float64],
-    node_sets: dict[str, NDArray[np.int64]],
+    hexahedra: Ints,
+    integration_points: Floats,
+    integration_volumes: Floats,
+    node_sets: dict[str, Ints],
     figures: dict[str, float],
-    surface_areas: NDArray[np.float64] | None = None,
+    surface_areas: Floats | None = None,
+    parts: tuple[Part, ...] = (),
 ) -> Mesh:
-    """A mesh that comes from no file: nodes count from 1, cell sets are all, hexahedra and cloud."""
+    """A mesh without a file: node numbers start at 1, and the cell sets are all, hexahedra and cloud."""
     cells = np.arange(len(hexahedra) + len(integration_points))
     return Mesh(
         points=points,
@@ -123,11 +124,12 @@ def numbered_mesh(
         cell_sets={"all": cells, "hexahedra": cells[: len(hexahedra)], "cloud": cells[len(hexahedra) :]},
         node_ids=np.arange(1, len(points) + 1),
         surface_areas=surface_areas,
+        parts=parts,
         figures=figures,
     )
 
 
-def structured_hexahedra(shape: tuple[int, int, int]) -> NDArray[np.int64]:
+def structured_hexahedra(shape: tuple[int, int, int]) -> Ints:
     """Hexahedra (n, 8) of a grid of (nx, ny, nz) cells whose nodes are numbered along x, then y, then z."""
     nx, ny, nz = shape
     lines = np.array([1, nx + 1, (nx + 1) * (ny + 1)])
@@ -136,19 +138,19 @@ def structured_hexahedra(shape: tuple[int, int, int]) -> NDArray[np.int64]:
     return first[:, None] + ((CORNERS + 1) // 2) @ lines
 
 
-def grid_points(shape: tuple[int, int, int], size: tuple[float, float, float]) -> NDArray[np.float64]:
-    """Nodes (n, 3), in m, of a grid of (nx, ny, nz) cells that fills [0, size]; x runs fastest."""
+def grid_points(shape: tuple[int, int, int], size: tuple[float, float, float]) -> Floats:
+    """Nodes (n, 3), m, of a grid of (nx, ny, nz) cells that fills the box [0, size]; x runs fastest."""
     axes = [np.linspace(0.0, length, n + 1) for n, length in zip(shape, size, strict=True)]
     z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
     return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
 
 
-def named_set(sets: dict[str, NDArray[np.int64]], name: str, origin: str) -> NDArray[np.int64]:
-    """The set of that name; an InputError that lists the sets there are, if there is none or it is empty."""
+def named_set(sets: dict[str, Ints], name: str, origin: str) -> Ints:
+    """The set with that name; InputError with the known names if it is missing or empty."""
     if name not in sets:
         near = difflib.get_close_matches(name, sets, 1)
-        meant = f"did you mean '{near[0]}'? Sets: " if near else "sets: "
-        raise InputError(f"{origin}: there is no set '{name}'; {meant}{', '.join(sorted(sets)) or 'none'}")
+        hint = f"did you mean '{near[0]}'? Sets: " if near else "sets: "
+        raise InputError(f"{origin}: there is no set '{name}'; {hint}{', '.join(sorted(sets)) or 'none'}")
     if len(sets[name]) == 0:
         raise InputError(f"{origin}: the set '{name}' is empty")
     return sets[name]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -188,49 +190,8 @@ right
 """
 
 #: The same with commas.
-DYNA_COMMAS = """*KEYWORD
-*NODE
-10,0.,0.,0.
-20,1.,0.,0.
-30,2.,0.,0.
-15,0.,1.,0.
-25,1.,1.,0.
-35,2.,1.,0.
-110,0.,0.,1.
-120,1.,0.,1.
-130,2.,0.,1.
-115,0.,1.,1.
-125,1.,1.,1.
-135,2.,1.,1.
-*ELEMENT_SOLID
-7,1
-10,20,25,15,110,120,125,115
-3,1
-20,30,35,25,120,130,135,125
-*PART
-solid
-1,1,1
-*MAT_ELASTIC_TITLE
-brain
-1,1e-9,3e-3,0.49
-*SET_NODE_LIST_TITLE
-left
-1
-10,15,110,115
-*SET_NODE_LIST_TITLE
-right
-2
-30,35,130,135
-*BOUNDARY_SPC_SET
-1,0,1,1,1
-*BOUNDARY_PRESCRIBED_MOTION_SET
-2,1,2,5,0.25
-*DEFINE_CURVE
-5
-0.,0.
-1.,1.
-*END
-"""
+DYNA_COMMAS = re.sub(r"(?m)^(?: +(?:[\d.e+-]+|&\w+))+$", lambda line: ",".join(line[0].split()), DYNA)
+DYNA_COMMAS = DYNA_COMMAS.replace("R    young      3e-3R     pois      0.49", "R    young,3e-3,R     pois,0.49")
 
 
 def numbers(rows: NDArray[np.generic]) -> str:

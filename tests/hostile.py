@@ -285,10 +285,7 @@ def readers(scratch: Path) -> dict[str, Reader]:
         "cases (CSV)": Reader(
             vary.table, {"cases": {"c.csv": b'solver.load_time,block.elements\n1.0,"[4,4,4]"\n2,\n'}}
         ),
-        "sweep.json": Reader(
-            lambda path: cases.read(path.parent),
-            {"sweep": {"sweep.json": sweep}},
-        ),
+        "sweep.json": Reader(lambda path: cases.read(path.parent), {"sweep": {"sweep.json": sweep}}),
         "reference (npz)": Reader(_reference(run), {"npz": {"r.npz": _npz()}}, unpack),
         "reference (CSV)": Reader(_reference(run), {"csv": {"r.csv": table.encode()}}),
         "reference (vtu)": Reader(_reference(run), {"vtu": {"r.vtu": _vtu(scratch)}}),

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from mpitled.deck import MeshFiles
 from mpitled.errors import InputError
 from mpitled.mesh import grid_points, structured_hexahedra
-from mpitled.preview import overview
 from mpitled.readers import meshes
 from mpitled.readers.meshfile import MeshFile, exterior_faces
 
@@ -74,26 +73,20 @@ def test_what_is_skipped_is_listed_if_it_may_matter(tmp_path):
     """Titles and requests for output are in every deck; those of contacts are no contacts."""
     output = "*OUTPUT, FIELD\n*NODE OUTPUT\n U,\n*CONTACT OUTPUT\n CSTRESS,\n*RESTART, WRITE\n*END STEP"
     file = read(tmp_path, FLAT.replace("*STATIC", "*VISCO").replace("*END STEP", output))
-    assert file.remarks == [f"{tmp_path / 'deck.inp'}: skipped, for nothing here depends on it: *VISCO"]
+    assert file.remarks == [f"{tmp_path / 'deck.inp'}: skipped, because the results do not depend on it: *VISCO"]
     assert file.refused == []
 
 
-def test_a_deck_that_is_cut_short_says_where(tmp_path):
-    """Within a part all nodes are of it, and without an instance none are there."""
+def test_a_deck_that_is_cut_short_is_recognised(tmp_path):
+    """Within a part all nodes belong to it; without an instance none of them is in the model."""
     cut = ASSEMBLY[: ASSEMBLY.index("*Elset, elset=Set-1")]
-    (tmp_path / "deck.inp").write_text(cut)
-    words = "part Cube, which has 8 nodes, has no *INSTANCE; the file ends within *PART Cube: is it cut short?"
-    with pytest.raises(InputError) as caught:
-        overview.check(tmp_path / "deck.inp")
-    assert str(caught.value) == f"{tmp_path / 'deck.inp'}: {words}"
-    whole = ASSEMBLY[: ASSEMBLY.index("*Assembly")]
+    with pytest.raises(InputError, match=r"Cube, .* has no \*INSTANCE; the file ends within \*PART Cube: is it cut"):
+        read(tmp_path, cut)
     with pytest.raises(InputError, match=r"which has 8 nodes, has no \*INSTANCE; add one$"):
-        read(tmp_path, whole)
-    clipped = read(tmp_path, FLAT + cut)
-    assert [remark.partition("deck.inp: ")[2] for remark in clipped.remarks if "warning" in remark] == [
-        "part Cube is in no *INSTANCE, so not there",
-        "the file ends within *PART Cube: is it cut short?",
-    ]
+        read(tmp_path, ASSEMBLY[: ASSEMBLY.index("*Assembly")])
+    assert [
+        remark.partition("deck.inp: ")[2] for remark in read(tmp_path, FLAT + cut).remarks if "warning" in remark
+    ] == ["part Cube has no *INSTANCE and is left out", "the file ends within *PART Cube: is it cut short?"]
 
 
 WRITTEN = {
@@ -227,7 +220,7 @@ def test_later_steps_take_nodes_over(tmp_path):
     assert at[35, 0] == {0.25}
     assert at[10, 0] == {-0.5}
     assert at[10, 1] == {0.0}
-    assert any("several steps; those at the end count" in remark for remark in file.remarks)
+    assert any("several steps; those of the last step count" in remark for remark in file.remarks)
     assert not any("several steps" in remark for remark in read(tmp_path, FLAT).remarks)  # held first, then moved
     new = read(tmp_path, FLAT + more.replace("*BOUNDARY", "*BOUNDARY, OP=NEW"))
     assert {c.displacement for c in new.constraints} == {(0.5,), (-0.5,)}
@@ -258,6 +251,8 @@ def test_nodes_one_by_one_are_one_constraint(tmp_path):
             "*NSET, NSET=left",
             "1 elements of type S4",
         ),
+        (FLAT[len(INCLUDED) :], f"*ELEMENT, TYPE=C3D20R\n 1{', 10' * 20}\n", "C3D20R"),
+        (FLAT[len(INCLUDED) :], "*ELEMENT, TYPE=CPS4R\n 1, 10, 20, 25, 15\n", "its elements are CPS4R (line 17)"),
     ],
 )
 def test_what_changes_the_mechanics_is_refused_by_name_and_line(tmp_path, old, new, words):
@@ -266,24 +261,6 @@ def test_what_changes_the_mechanics_is_refused_by_name_and_line(tmp_path, old, n
     with pytest.raises(InputError) as caught:
         meshes.read_mesh(MeshFiles(fe=path))
     assert words in str(caught.value)
-
-
-def test_second_order_hexahedra_are_refused_and_shells_are_no_solid(tmp_path):
-    row = ", ".join(map(str, [1, *FLAT_IDS, *FLAT_IDS[:8]]))
-    for deck, words in (
-        (INCLUDED + f"*ELEMENT, TYPE=C3D20R\n {row}\n", "C3D20R"),
-        (
-            INCLUDED + "*ELEMENT, TYPE=CPS4R\n 1, 10, 20, 25, 15\n",
-            "no solid elements; its elements are CPS4R (line 17)",
-        ),
-    ):
-        (tmp_path / "deck.inp").write_text(deck)
-        with pytest.raises(InputError) as caught:
-            overview.check(tmp_path / "deck.inp")
-        assert words in str(caught.value)
-
-
-FLAT_IDS = [10, 20, 30, 15, 25, 35, 110, 120, 130, 115, 125, 135]
 
 
 def test_faces_that_gmsh_writes_as_elements_are_node_sets(tmp_path):
@@ -330,7 +307,7 @@ WRONG = {
     "missing include": ("*INCLUDE, INPUT=gone.inp\n" + FLAT, "line 1: *INCLUDE names gone.inp"),
     "circle": ("*INCLUDE, INPUT=deck.inp\n" + FLAT, "break the circle"),
     "unknown part": (ASSEMBLY.replace("part=Cube\n", "part=Cub\n", 1), "names part Cub"),
-    "copies": (FLAT.replace("*ELEMENT", "*NGEN\n 10, 20\n*ELEMENT"), "*NGEN makes nodes"),
+    "copies": (FLAT.replace("*ELEMENT", "*NGEN\n 10, 20\n*ELEMENT"), "*NGEN generates nodes"),
 }
 
 

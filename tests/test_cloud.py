@@ -10,7 +10,11 @@ from mpitled import deck
 from mpitled.errors import InputError
 from mpitled.mesh import grid_points, structured_hexahedra
 from mpitled.meshing.block import block_mesh
-from mpitled.meshing.cloud import CLOSEST, Spacing, boundary_faces, cut, fill_void, subdivide, volumes_and_centroids
+from mpitled.meshing.cloud import build_cloud
+from mpitled.meshing.faces import boundary_faces
+from mpitled.meshing.integration_cells import cut, subdivide, volumes_and_centroids
+from mpitled.meshing.scatter import CLOSEST
+from mpitled.meshing.spacing import Spacing
 
 CLOUD = deck.Cloud(points_per_spacing=1.4, growth=0.3)
 SEED_VOLUME = 4 / 3 * np.pi * 0.002**3
@@ -69,62 +73,63 @@ def test_cloud_around_a_seed(shape):
     middle = points[hexahedra].mean(axis=1)
     centre = middle[555] + 0.0007
     dropped = np.linalg.norm(middle - centre, axis=1) < 0.014
-    filling = fill_void(points, hexahedra, dropped, CLOUD, tumour(tuple(centre)), 0.004)
+    mesh, spacing = build_cloud(points, hexahedra, dropped, {}, CLOUD, tumour(tuple(centre)), 0.004)
 
     void = flux_volume(points, boundary_faces(hexahedra[dropped]))
-    volumes = filling.integration_volumes
-    assert filling.figures["void_volume_m3"] == pytest.approx(void, rel=1e-12)
+    volumes = mesh.integration_volumes
+    assert mesh.figures["void_volume_m3"] == pytest.approx(void, rel=1e-12)
     assert volumes.sum() == pytest.approx(void - SEED_VOLUME, rel=1e-12)
     assert volumes.min() > 0
     # Before it is made exact, the sum is off by the sampling of cut cells: asked is 0.1 % of the seed.
-    sampled = filling.figures["integration_volume_before_rescaling_m3"]
+    sampled = mesh.figures["integration_volume_before_rescaling_m3"]
     assert abs(sampled - (void - SEED_VOLUME)) < 1e-3 * SEED_VOLUME
     # So are the first moments, in radii of the seed.
-    moments = volumes @ filling.integration_points
+    moments = volumes @ mesh.integration_points
     cells, centroids = volumes_and_centroids(points[hexahedra[dropped]])
     np.testing.assert_allclose(moments, cells @ centroids - SEED_VOLUME * centre, atol=0.01 * SEED_VOLUME * 0.002)
-    distance = np.linalg.norm(filling.integration_points - centre, axis=1)
+    distance = np.linalg.norm(mesh.integration_points - centre, axis=1)
     assert distance.min() >= 0.002 * (1 - 1e-12)
-    assert 2.4 < filling.figures["integration_points_per_efg_node"] < 4
+    assert 2.4 < mesh.figures["integration_points_per_efg_node"] < 4
 
-    seed = filling.points[filling.seed_nodes]
+    seed = mesh.points[mesh.node_sets["tumour"]]
     assert len(seed) == 400
     np.testing.assert_allclose(np.linalg.norm(seed - centre, axis=1), 0.002, rtol=1e-12)
-    tree = cKDTree(filling.points)
-    inner = filling.points[filling.seed_nodes[-1] + 1 :]
-    spacing = filling.spacing(inner)
+    tree = cKDTree(mesh.points)
+    inner = mesh.points[mesh.node_sets["tumour"][-1] + 1 :]
     assert np.linalg.norm(inner - centre, axis=1).min() > 0.002
-    assert (tree.query(inner, k=2)[0][:, 1] >= CLOSEST * spacing * (1 - 1e-12)).all()
+    assert (tree.query(inner, k=2)[0][:, 1] >= CLOSEST * spacing(inner) * (1 - 1e-12)).all()
     # Holes: no place outside the seed is farther from a node than 1.25 spacings (0.87 on a cubic grid, 1.1 measured).
     rng = np.random.default_rng(3)
     corners = points[hexahedra[dropped]]
     places = (rng.dirichlet(np.ones(8), (40, len(corners)))[..., None] * corners).sum(axis=2).reshape(-1, 3)
     places = places[np.linalg.norm(places - centre, axis=1) > 0.002]
-    assert (tree.query(places)[0] / filling.spacing(places)).max() < 1.25
+    assert (tree.query(places)[0] / spacing(places)).max() < 1.25
     # Next to the seed the spacing is that of the surface's nodes; it grows by less than `growth` a neighbour.
     at_surface = np.sqrt(4 * np.pi * 0.002**2 / 400)
-    assert filling.spacing(seed)[0] == pytest.approx(at_surface)
-    assert filling.spacing(centre[None] + (0.004, 0, 0))[0] == pytest.approx(at_surface + 0.3 * 0.002)
+    assert spacing(seed)[0] == pytest.approx(at_surface)
+    assert spacing(centre[None] + (0.004, 0, 0))[0] == pytest.approx(at_surface + 0.3 * 0.002)
 
 
 def test_hexahedra_that_remain_keep_their_nodes_and_no_node_is_orphaned():
     points, hexahedra = distorted_block()
     dropped = np.linalg.norm(points[hexahedra].mean(axis=1) - points.mean(axis=0), axis=1) < 0.012
-    filling = fill_void(points, hexahedra, dropped, CLOUD, None, 0.004)
-    np.testing.assert_array_equal(filling.points[filling.hexahedra], points[hexahedra[~dropped]])
-    np.testing.assert_array_equal(np.unique(filling.hexahedra), np.arange(filling.n_fe_nodes))
-    void_boundary = np.unique(boundary_faces(hexahedra[dropped]))
-    np.testing.assert_array_equal(filling.interface, filling.renumber(void_boundary))
-    assert (filling.interface < filling.n_fe_nodes).all()
     gone = np.setdiff1d(np.unique(hexahedra[dropped]), np.unique(hexahedra[~dropped]))
-    assert (filling.new_numbers[gone] == -1).all()
+    node_sets = {"boundary": np.unique(boundary_faces(hexahedra[dropped])), "gone": gone}
+    mesh = build_cloud(points, hexahedra, dropped, node_sets, CLOUD, None, 0.004).mesh
+    np.testing.assert_array_equal(mesh.points[mesh.hexahedra], points[hexahedra[~dropped]])
+    np.testing.assert_array_equal(np.unique(mesh.hexahedra), np.arange(mesh.n_fe_nodes))
+    np.testing.assert_array_equal(mesh.node_sets["interface"], mesh.node_sets["boundary"])
+    assert (mesh.node_sets["interface"] < mesh.n_fe_nodes).all()
+    assert len(mesh.node_sets["gone"]) == 0
 
 
 def test_same_deck_same_bits_and_another_seed_another_cloud():
     points, hexahedra = distorted_block()
     dropped = np.linalg.norm(points[hexahedra].mean(axis=1) - points.mean(axis=0), axis=1) < 0.012
     one, two, other = (
-        fill_void(points, hexahedra, dropped, deck.Cloud(seed=seed), tumour(tuple(points.mean(axis=0))), 0.004)
+        build_cloud(
+            points, hexahedra, dropped, {}, deck.Cloud(seed=seed), tumour(tuple(points.mean(axis=0))), 0.004
+        ).mesh
         for seed in (0, 0, 1)
     )
     for name in ("points", "integration_points", "integration_volumes", "hexahedra"):

@@ -23,7 +23,7 @@ from mpitled import resources, store
 from mpitled.batch import vary
 from mpitled.deck import load_deck
 from mpitled.errors import InputError
-from mpitled.meshing.labels import read_image
+from mpitled.meshing.label_image import read_image
 from mpitled.model.build import build
 from mpitled.readers import abaqus, tables
 from mpitled.results import compare

@@ -14,8 +14,9 @@ from scipy.sparse.csgraph import connected_components
 
 from mpitled import deck
 from mpitled.errors import InputError
-from mpitled.meshing.cloud import FACES, boundary_faces
-from mpitled.meshing.labels import mesh_labels, solid_cells
+from mpitled.meshing.faces import FACES, boundary_faces
+from mpitled.meshing.head import Grid, solid_cells
+from mpitled.meshing.labels import mesh_labels
 
 nibabel = pytest.importorskip("nibabel")
 
@@ -143,22 +144,19 @@ def test_the_tumour_of_the_decks_fits_at_every_element_size(element_size):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_random_solids_are_repaired(seed):
-    """Noise has hundreds of edges and vertices where the solid meets itself, cavities and loose pieces."""
+    """Noise has hundreds of non-manifold edges and vertices, cavities and loose pieces."""
     share = np.zeros((16, 15, 14))
     share[2:-2, 2:-2, 2:-2] = np.random.default_rng(seed).random((12, 11, 10))
     solid, added = solid_cells(share)
     assert added > 0
-    index = np.arange(17 * 16 * 15).reshape(17, 16, 15)
-    corners = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
-    hexahedra = np.stack([index[k : k + 16, j : j + 15, i : i + 14][solid] for i, j, k in corners], axis=1)
+    _, hexahedra = Grid(np.zeros(3), 1.0, (14, 15, 16)).hexahedra(solid)
     assert n_pieces(hexahedra) == 1
     surface = boundary_faces(hexahedra)
     assert_manifold(surface)
-    inside = connected_components(
-        coo_array((np.ones(4 * len(surface)), (np.repeat(surface[:, 0], 4), surface.ravel())), (index.size,) * 2),
-        directed=False,
-    )[1]
-    assert len(np.unique(inside[np.unique(surface)])) == 1  # one surface: no cavity
+    nodes, faces = np.unique(surface, return_inverse=True)
+    edges = (np.repeat(faces.reshape(-1, 4)[:, 0], 4), faces.ravel())
+    graph = coo_array((np.ones(faces.size), edges), (len(nodes),) * 2)
+    assert connected_components(graph, directed=False)[0] == 1  # one surface: no cavity
 
 
 # --- phantoms --------------------------------------------------------------------------------------------------------
@@ -262,6 +260,13 @@ def test_a_ventricle_within_the_void_is_tied_to_the_rest(tmp_path):
     assert np.linalg.norm(middle - seed.centre, axis=1).max() < 0.019
 
 
+def refused(labels, message, seed=None):
+    with pytest.raises(InputError, match=message) as error:
+        mesh_labels(labels, deck.Cloud(), seed)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -271,100 +276,18 @@ def test_a_ventricle_within_the_void_is_tied_to_the_rest(tmp_path):
         (lambda data, affine: (np.where(data == 5, 41, data).astype(np.int16), affine), r"label 5 .*left_ventricle"),
         (lambda data, affine: (np.zeros_like(data), affine), r"label 41 .*tissue"),
         (lambda data, affine: (data.astype(np.complex64), affine), "complex64"),
+        (None, "no such file"),
+        (b"not an image", "not an image"),
+        ((DATA / "mni152_labels_2mm.nii.gz").read_bytes()[:9999], "not an image"),
     ],
 )
-def test_bad_images_get_one_line_that_names_file_and_remedy(tmp_path, change, message):
-    path = save(tmp_path / "bad.nii.gz", *change(*phantom()))
-    with pytest.raises(InputError, match=message) as error:
-        mesh_labels(labels_of(path), deck.Cloud(), None)
-    assert str(error.value).startswith(str(path))
-    assert "\n" not in str(error.value)
-
-
-def tilt(degrees):
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    return np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-
-
-def test_files_that_are_no_image(tmp_path):
-    whole = (DATA / "mni152_labels_2mm.nii.gz").read_bytes()
-    for name, content, message in (
-        ("missing.nii.gz", None, "no such file"),
-        ("text.nii.gz", b"not an image", "not an image"),
-        ("text.txt", b"not an image", "not an image"),
-        ("short.nii.gz", whole[: len(whole) // 2], "not an image"),
-    ):
-        path = tmp_path / name
-        if content is not None:
-            path.write_bytes(content)
-        with pytest.raises(InputError, match=message) as error:
-            mesh_labels(labels_of(path), deck.Cloud(), None)
-        assert str(error.value).startswith(str(path))
-        assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("centre", "message"),
-    [
-        # The ellipsoid ends at x = 37 mm, and a cube's edge is 4 mm.
-        ((0.5, -0.005, 0.007), r"outside the brain, 46[1-7](\.\d)? mm from the nearest tissue"),
-        ((0.003, 0.0362, 0.007), "from the skull's|outside"),
-        ((-0.0035, -0.005, 0.007), "in the left ventricle"),
-        ((0.003, -0.043, 0.007), "mm from the skull's hexahedra"),
-    ],
-)
-def test_a_tumour_that_does_not_lie_in_tissue_is_refused(tmp_path, centre, message):
-    path = save(tmp_path / "p.nii", *phantom())
-    with pytest.raises(InputError, match=message) as error:
-        mesh_labels(labels_of(path), deck.Cloud(), tumour(centre))
-    assert str(error.value).startswith("tumour.centre = (")
-    assert "move it" in str(error.value)
-
-
-def test_a_tumour_without_room_is_told_the_nearest_place_that_has_it(tmp_path):
-    path = save(tmp_path / "p.nii", *phantom())
-    for centre, what in (((0.003, 0.032, 0.007), "skull"), ((-0.0125, -0.005, 0.007), "left ventricle")):
-        with pytest.raises(
-            InputError, match=rf"from the {what}'s hexahedra, .* need 6 mm; move it \(the near"
-        ) as error:
-            mesh_labels(labels_of(path), deck.Cloud(), tumour(centre))
-        told = re.search(r"has it is \((.*)\) mm\)", str(error.value))[1]
-        nearest = tuple(float(x) / 1e3 for x in told.split(","))
-        assert 0 < np.linalg.norm(np.subtract(nearest, centre)) < 0.015
-        mesh_labels(labels_of(path), deck.Cloud(), tumour(nearest))
-
-
-def test_an_image_may_have_more_axes_than_it_needs_and_has_to_say_where_it_is(tmp_path):
-    data, affine = phantom()
-    same = mesh_labels(labels_of(save(tmp_path / "p.nii", data, affine), 0.0009), deck.Cloud(), None)
-    assert any("element_size = 0.9 mm: is smaller than a voxel" in remark for remark in same.remarks)
-    nibabel.save(nibabel.Nifti1Image(data[..., None], None), tmp_path / "nowhere.nii")
-    mesh = mesh_labels(labels_of(tmp_path / "nowhere.nii"), deck.Cloud(), None)
-    assert any("does not say where its voxels are" in remark for remark in mesh.remarks)
-
-
-def test_a_centre_in_voxels_is_told_in_millimetres(tmp_path):
-    """By the file's own axes, whichever way they run."""
-    path = tmp_path / "turned.nii.gz"
-    original = nibabel.load(DATA / "mni152_labels_2mm.nii.gz")
-    turned = original.as_reoriented(np.array([[1, -1], [2, 1], [0, -1]]))
-    nibabel.save(turned, path)
-    voxel = np.round(np.linalg.inv(turned.affine) @ (-32.0, -20.0, 10.0, 1.0))
-    there = ", ".join(f"{x:g}" for x in (turned.affine @ voxel)[:3])
-    labels = deck.Labels(image=path, element_size=0.006)
-    with pytest.raises(InputError) as error:
-        mesh_labels(labels, deck.Cloud(), tumour(tuple(1e-3 * voxel[:3])))
-    assert str(error.value).endswith(f"; it looks like voxels: in mm it is ({there})")
-    with pytest.raises(InputError) as error:
-        mesh_labels(labels, deck.Cloud(), tumour((0.5, -0.005, 0.007)))
-    assert "voxels" not in str(error.value)
-
-
-def test_a_centre_in_metres_is_told_in_millimetres(tmp_path):
-    path = save(tmp_path / "p.nii", *phantom())
-    # (20, -5, 7) mm is tissue, and the place itself is too near to a ventricle.
-    with pytest.raises(InputError, match=r"; it looks like metres: in mm it is \(20, -5, 7\)$"):
-        mesh_labels(labels_of(path), deck.Cloud(), tumour((0.02e-3, -0.005e-3, 0.007e-3)))
+def test_bad_images_get_one_line_with_the_file(tmp_path, change, message):
+    path = tmp_path / "bad.nii.gz"
+    if isinstance(change, bytes):
+        path.write_bytes(change)
+    elif change:
+        save(path, *change(*phantom()))
+    assert refused(labels_of(path), message).startswith(str(path))
 
 
 @pytest.mark.parametrize(
@@ -379,18 +302,64 @@ def test_a_centre_in_metres_is_told_in_millimetres(tmp_path):
         ({"left_ventricle": (5, 44)}, r"label 44 \(labels.left_ventricle\) is not in it; leave it out, .* 5, 7, 41$"),
     ],
 )
-def test_labels_section_that_cannot_be_met(tmp_path, keys, message):
-    path = save(tmp_path / "p.nii", *phantom())
-    with pytest.raises(InputError, match=message):
-        mesh_labels(labels_of(path, **keys), deck.Cloud(), None)
+def test_keys_that_do_not_fit_the_image_are_refused(tmp_path, keys, message):
+    refused(labels_of(save(tmp_path / "p.nii", *phantom()), **keys), message)
 
 
-def test_a_brain_without_ventricles(tmp_path):
-    path = save(tmp_path / "p.nii", *phantom())
-    labels = labels_of(path, tissue=(5, 7, 41), left_ventricle=(), right_ventricle=())
+def tilt(degrees):
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("centre", "message"),
+    [
+        # The ellipsoid ends at x = 37 mm, and a cube's edge is 4 mm.
+        ((0.5, -0.005, 0.007), r"outside the brain, 46[1-7](\.\d)? mm from the nearest tissue"),
+        ((0.003, 0.0362, 0.007), "from the skull's|outside"),
+        ((-0.0035, -0.005, 0.007), "in the left ventricle"),
+        ((0.003, -0.043, 0.007), "mm from the skull's hexahedra"),
+        ((0.02e-3, -0.005e-3, 0.007e-3), r"; it looks like metres: in mm it is \(20, -5, 7\)$"),
+    ],
+)
+def test_a_tumour_outside_the_tissue_is_refused(tmp_path, centre, message):
+    line = refused(labels_of(save(tmp_path / "p.nii", *phantom())), message, tumour(centre))
+    assert line.startswith("tumour.centre = (")
+    assert "move it" in line
+
+
+def test_a_message_proposes_a_position_that_is_accepted(tmp_path):
+    labels = labels_of(save(tmp_path / "p.nii", *phantom()))
+    for centre, part in (((0.003, 0.032, 0.007), "skull"), ((-0.0125, -0.005, 0.007), "left ventricle")):
+        line = refused(labels, rf"from the {part}'s hexahedra, .* need 6 mm; move it \(the near", tumour(centre))
+        nearest = tuple(float(x) / 1e3 for x in re.search(r"has it is \((.*)\) mm\)", line)[1].split(","))
+        assert 0 < np.linalg.norm(np.subtract(nearest, centre)) < 0.015
+        mesh_labels(labels, deck.Cloud(), tumour(nearest))
+
+
+def test_images_with_redundant_axes_or_without_a_position_are_read(tmp_path):
+    data, affine = phantom()
+    same = mesh_labels(labels_of(save(tmp_path / "p.nii", data, affine), 0.0009), deck.Cloud(), None)
+    assert any("element_size = 0.9 mm: is smaller than a voxel" in remark for remark in same.remarks)
+    nibabel.save(nibabel.Nifti1Image(data[..., None], None), tmp_path / "nowhere.nii")
+    labels = labels_of(tmp_path / "nowhere.nii", tissue=(5, 7, 41), left_ventricle=(), right_ventricle=())
     mesh = mesh_labels(labels, deck.Cloud(), None)
-    assert set(mesh.cell_sets) == {"all", "tissue"}
-    assert set(mesh.node_sets) == {"skull"}
+    assert any("does not give the position of its voxels" in remark for remark in mesh.remarks)
+    assert (set(mesh.cell_sets), set(mesh.node_sets)) == ({"all", "tissue"}, {"skull"})
+
+
+def test_a_centre_in_voxels_is_told_in_millimetres(tmp_path):
+    """By the file's own axes, whichever way they run."""
+    path = tmp_path / "turned.nii.gz"
+    original = nibabel.load(DATA / "mni152_labels_2mm.nii.gz")
+    turned = original.as_reoriented(np.array([[1, -1], [2, 1], [0, -1]]))
+    nibabel.save(turned, path)
+    voxel = np.round(np.linalg.inv(turned.affine) @ (-32.0, -20.0, 10.0, 1.0))
+    there = ", ".join(f"{x:g}" for x in (turned.affine @ voxel)[:3])
+    labels = deck.Labels(image=path, element_size=0.006)
+    line = refused(labels, "outside", tumour(tuple(1e-3 * voxel[:3])))
+    assert line.endswith(f"; it looks like voxels: in mm it is ({there})")
+    assert "voxels" not in refused(labels, "outside", tumour((0.5, -0.005, 0.007)))
 
 
 def test_ventricles_named_the_wrong_way_round_are_warned_of(tmp_path):

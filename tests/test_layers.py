@@ -13,7 +13,9 @@ from test_kernels import HOURGLASS, at, forces, part
 from mpitled import deck, store
 from mpitled.errors import InputError
 from mpitled.mesh import grid_points, structured_hexahedra
-from mpitled.meshing.cloud import CLOSEST, fill_void, volumes_and_centroids
+from mpitled.meshing.cloud import build_cloud
+from mpitled.meshing.integration_cells import volumes_and_centroids
+from mpitled.meshing.scatter import CLOSEST
 from mpitled.model.build import build, discretise, read_mesh
 from mpitled.parallel.subdomain import localise
 from mpitled.results import field
@@ -183,8 +185,8 @@ def test_a_cloud_is_as_fine_as_the_interface(tmp_path):
     points, hexahedra = grid_points((12, 12, 8), (0.024, 0.024, 0.032)), structured_hexahedra((12, 12, 8))
     sphere = deck.Sphere(name="upper", centre=(0.012, 0.012, 1.016), radius=1.0)
     dropped = np.ones(len(hexahedra), bool)
-    coarse, fine = (
-        fill_void(points, hexahedra, dropped, deck.Cloud(), None, 0.004, spheres) for spheres in ((), (sphere,))
+    (coarse, _), (fine, spacing) = (
+        build_cloud(points, hexahedra, dropped, {}, deck.Cloud(), None, 0.004, spheres) for spheres in ((), (sphere,))
     )
     assert len(coarse.parts) == 1
     inside = [(np.abs(f.points - [0.012, 0.012, 0.016]) < [0.01, 0.01, 0.004]).all(axis=1) for f in (coarse, fine)]
@@ -192,8 +194,8 @@ def test_a_cloud_is_as_fine_as_the_interface(tmp_path):
     assert inside[0].sum() < 0.5 * volume / 0.002**3
     assert inside[1].sum() == pytest.approx(volume / 0.002**3, rel=0.3)
     middles = (points[:12] + points[14:26]) / 2 + [0, 0, 0.016]
-    np.testing.assert_allclose(fine.spacing(middles), 0.002, rtol=1e-9)
+    np.testing.assert_allclose(spacing(middles), 0.002, rtol=1e-9)
     scattered = fine.points[-len(fine.points) // 4 :]
     away = np.linalg.norm(scattered[:, None] - scattered, axis=2) + np.eye(len(scattered))
-    assert (away.min(axis=1) >= CLOSEST * fine.spacing(scattered) * (1 - 1e-12)).all()
+    assert (away.min(axis=1) >= CLOSEST * spacing(scattered) * (1 - 1e-12)).all()
     assert fine.integration_volumes.sum() == pytest.approx(volumes_and_centroids(points[hexahedra])[0].sum(), rel=1e-12)

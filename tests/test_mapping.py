@@ -8,7 +8,7 @@ from conftest import ROOT
 
 from mpitled import deck
 from mpitled.errors import InputError
-from mpitled.meshing.cloud import on_sphere
+from mpitled.meshing.scatter import fibonacci_sphere
 from mpitled.model import build as model_build
 from mpitled.model import mapping
 
@@ -39,10 +39,10 @@ def smooth(x):
 
 def test_error_on_a_surface_falls_with_the_cube_of_the_distance(tmp_path):
     """Nodes lie between the places and, as a hexahedron's face does, a little below the surface."""
-    nodes = 50 * on_sphere(701)
+    nodes = 50 * fibonacci_sphere(701)
     errors = []
     for n in (2000, 8000):
-        places = 50 * on_sphere(n)
+        places = 50 * fibonacci_sphere(n)
         path = write(tmp_path / f"{n}.csv", places, smooth(places))
         found = mapping.carry_over(path, 1e-3, 1e-3 * nodes, "here")
         errors.append(np.abs(1e3 * found - smooth(nodes)).max())
@@ -71,7 +71,7 @@ def test_quadratic_fields_are_exact_in_a_volume_and_in_a_plane(tmp_path):
 
 def test_field_in_the_deck(tmp_path):
     """In the directions asked for, in the unit said, on top of which nothing else is moved."""
-    places = 50 * on_sphere(1500)
+    places = 50 * fibonacci_sphere(1500)
     write(tmp_path / "field.csv", places / 10, smooth(places) / 10)
     path = tmp_path / "scene.toml"
     path.write_text(SCENE + 'field_unit = "cm"\ndirections = ["x", "z"]\n')
@@ -98,7 +98,7 @@ def test_field_in_the_deck(tmp_path):
     ],
 )
 def test_what_is_wrong_with_a_field_is_said_in_a_line(tmp_path, change, message):
-    places = 50 * on_sphere(1500)
+    places = 50 * fibonacci_sphere(1500)
     rows = change(np.hstack([places, smooth(places)]))
     np.savetxt(tmp_path / "field.csv", rows, "%.17g", ",", header="x,y,z,ux,uy,uz", comments="")
     (tmp_path / "scene.toml").write_text(SCENE)

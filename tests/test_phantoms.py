@@ -11,9 +11,9 @@ from mpitled.cells import hexahedra
 from mpitled.cells import support_domains as support
 from mpitled.errors import InputError
 from mpitled.mesh import Rotation
-from mpitled.meshing import o_grid as onion
+from mpitled.meshing import o_grid
 from mpitled.meshing.block import block_mesh
-from mpitled.meshing.cloud import boundary_faces
+from mpitled.meshing.faces import boundary_faces
 from mpitled.meshing.phantoms import cylinder_mesh, ellipsoid_mesh
 from mpitled.model import build as model_build
 from mpitled.model import loading
@@ -134,7 +134,7 @@ def test_graded_elements_are_thin_where_surfaces_change():
     assert layers[0] == pytest.approx(layers[-1]) == layers.min()
     # The map's slope at its end is the share; half a layer inwards it is more by the second order.
     for n in (20, 40):
-        thinnest = n * (1 - onion.graded(n, 0.25)[-2])
+        thinnest = n * (1 - o_grid.graded(n, 0.25)[-2])
         assert thinnest - 0.25 == pytest.approx(0.75 * np.pi**2 / 6 / n**2, rel=0.01)
 
 
@@ -273,7 +273,7 @@ def test_nodes_beside_the_seed_move_as_incompressible_tissue():
 
 
 def test_a_seed_needs_room():
-    with pytest.raises(InputError, match=r"tumour.centre = \(75, 0, 8\) mm: seed and an element's size"):
+    with pytest.raises(InputError, match=r"tumour.centre = \(75, 0, 8\) mm: the seed and an element's size"):
         ellipsoid(tumour=deck.Tumour(centre=(0.075, 0.0, 0.008), volume=523.6e-9))
     with pytest.raises(InputError, match=r'cylinder.cloud = "none"'):
         cylinder(tumour=TUMOUR)

@@ -19,7 +19,8 @@ from mpitled import info, results, store
 from mpitled.cells import hexahedra
 from mpitled.deck import Cloud, load_deck
 from mpitled.mesh import grid_points, structured_hexahedra
-from mpitled.meshing.cloud import boundary_faces, fill_void, interface_faces
+from mpitled.meshing.cloud import build_cloud
+from mpitled.meshing.faces import boundary_faces, interface_faces
 from mpitled.model.build import build
 from mpitled.results import figures, report
 from mpitled.results.final_state import FinalState
@@ -220,9 +221,9 @@ def test_interface_is_where_the_cloud_is():
     dropped = np.zeros(len(cells), bool)
     dropped[9:] = True
     dropped[13] = False
-    filling = fill_void(points, cells, dropped, Cloud(), None, 0.01)
-    faces = interface_faces(filling.points, filling.hexahedra, filling.interface, filling.integration_points)
-    heights = filling.points[faces].mean(axis=1)[:, 2]
+    mesh = build_cloud(points, cells, dropped, {}, Cloud(), None, 0.01).mesh
+    faces = interface_faces(mesh.points, mesh.hexahedra, mesh.node_sets["interface"], mesh.integration_points)
+    heights = mesh.points[faces].mean(axis=1)[:, 2]
     assert sorted(np.round(heights, 6)) == [0.01] * 8 + [0.015] * 4
 
 

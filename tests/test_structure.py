@@ -78,7 +78,8 @@ def test_libraries_have_one_importer():
         assert importers[library]
         assert {name for name in importers[library] if not f"{name}.".startswith(f"{owner}.")} == set()
     assert len(importers.get("meshio", ())) <= 1
-    assert importers["nibabel"] == {"mpitled.meshing.labels", "mpitled.results.images"}  # one reads, the other writes
+    # One reads, the other writes.
+    assert importers["nibabel"] == {"mpitled.meshing.label_image", "mpitled.results.images"}
     assert not {"tests", "conftest", "pytest", "hypothesis", "vtk", "pandas"} & set(importers)
 
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from mpitled.batch import launch
 from mpitled.cells import hexahedra
-from mpitled.meshing.cloud import on_sphere
+from mpitled.meshing.scatter import fibonacci_sphere
 from mpitled.results import compare, field
 
 HERE = Path(__file__).parent
@@ -214,7 +214,7 @@ def shares(ours: field.Field, rho: NDArray[np.float64], exact: NDArray[np.float6
     held, _ = field.prescribed(ours.model)
     nodes = ours.model.points[~held]
     radii = np.geomspace(SHELL_BANDS[0], SHELL_BANDS[-1], 40, endpoint=False)
-    places = (radii[:, None, None] * on_sphere(100)).reshape(-1, 3)
+    places = (radii[:, None, None] * fibonacci_sphere(100)).reshape(-1, 3)
     points = np.concatenate([nodes, places])
     found = np.concatenate([ours.at_nodes[~held], ours.at(places).displacement])
     distance = np.linalg.norm(points, axis=1)

@@ -1,4 +1,4 @@
-"""What can be wrong with cells, nodes and constraints, found before anything is computed."""
+"""Checks of cells, nodes and constraints before anything is computed."""
 
 from __future__ import annotations
 
@@ -6,32 +6,33 @@ from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpitled.cells import hexahedra
+from mpitled.mesh import Bools, Floats, Ints
+from mpitled.meshing.faces import FACES
 
-#: Orders in which programs number a hexahedron's nodes that are not Abaqus's: top and bottom exchanged (or mirrored),
-#: along x, then y, then z, and that one mirrored. Nodes in such an order are taken in the order given here.
+#: Other programs' orders of a hexahedron's nodes: top and bottom exchanged (or mirrored), along x, then y, then z, and
+#: the latter mirrored. A row gives the nodes of such a hexahedron in Abaqus's order.
 ORDERS = np.array([[4, 5, 6, 7, 0, 1, 2, 3], [0, 1, 3, 2, 4, 5, 7, 6], [4, 5, 7, 6, 0, 1, 3, 2]])
-#: Singular values of the prescribed part of rigid motions below this share of the largest are none.
+#: Singular values of the prescribed part of rigid motions below this share of the largest count as zero.
 _FREE = 1e-6
-_NEAR = 16  # cells by centre among which one that holds a point is looked for
+_NEAR = 16  # cells with the nearest centres that are tested for holding a point
 
 
-def reordered(points: NDArray[np.float64], cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Hexahedra (len(rows), 8) with their nodes in an order that makes them sound; rows of -1 where none does."""
+def reordered(points: Floats, cells: Ints, rows: Ints) -> Ints:
+    """Hexahedra (len(rows), 8) with their nodes in an order that makes them valid; rows of -1 where no order does."""
     found = np.full((len(rows), 8), -1, np.int64)
     for order in ORDERS:
         open_rows = np.flatnonzero(found[:, 0] < 0)
         trial = cells[rows[open_rows]][:, order]
-        sound = hexahedra.scaled_jacobian(points, trial) > 0
-        found[open_rows[sound]] = trial[sound]
+        valid = hexahedra.scaled_jacobian(points, trial) > 0
+        found[open_rows[valid]] = trial[valid]
     return found
 
 
-def coincident(points: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
-    """Nodes (n,) that have another one before them at the same place, or within the tolerance."""
+def coincident(points: Floats, tolerance: float) -> Ints:
+    """Nodes (n,), ascending, that have an earlier node at the same point or within the tolerance, m."""
     order = np.lexsort(points.T)
     same = (np.diff(points[order], axis=0) == 0).all(axis=1)
     rest = np.sort(order[~np.append(False, same)]) if len(order) else order
@@ -43,9 +44,9 @@ def coincident(points: NDArray[np.float64], tolerance: float) -> NDArray[np.int6
     return np.sort(np.concatenate(found))
 
 
-def repeated(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of cells (n, k) that have the same nodes as one before them, in whatever order, and these rows before."""
-    # Sums of scrambled numbers (Steele and others 2014) tell sets of nodes apart, but for a chance of 2^-64.
+def repeated(cells: Ints) -> tuple[Ints, Ints]:
+    """Rows of cells (n, k) with the same nodes, in any order, as an earlier row, and these earlier rows."""
+    # Sums of hashed numbers (Steele et al. 2014) identify sets of nodes up to a probability of 2^-64.
     sums = np.zeros(len(cells), np.uint64)
     for column in cells.T:
         mixed = column.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
@@ -56,8 +57,8 @@ def repeated(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.in
     return order[again], order[again - 1]
 
 
-def pieces(cells: Sequence[NDArray[np.int64]], n_nodes: int) -> NDArray[np.int64]:
-    """Piece (n_nodes,) of each node, 0, 1, ...; nodes of one cell are of one piece. -1: no cell has it."""
+def pieces(cells: Sequence[Ints], n_nodes: int) -> Ints:
+    """Connected piece (n_nodes,) of each node: 0, 1, ...; -1 without a cell. The nodes of a cell are in one piece."""
     parent = np.arange(n_nodes)
     used = np.zeros(n_nodes, bool)
     for some in cells:
@@ -91,14 +92,14 @@ def _join(parent, cells):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _roots(parent):  # type: ignore[no-untyped-def]
-    """A node's parent has no larger number than itself: so one pass is enough."""
+    """Roots of all nodes. A parent's number is at most its node's, so one pass is enough."""
     for node in range(parent.size):
         parent[node] = parent[parent[node]]
     return parent
 
 
-def free_rigid_modes(points: NDArray[np.float64], dofs: NDArray[np.int64]) -> int:
-    """How many of the six rigid motions (small rotations) leave all prescribed dofs at rest."""
+def free_rigid_modes(points: Floats, dofs: Ints) -> int:
+    """Number of the six rigid motions (small rotations) that leave all prescribed dofs at rest."""
     if len(dofs) == 0:
         return 6
     node, direction = np.divmod(dofs, 3)
@@ -109,19 +110,13 @@ def free_rigid_modes(points: NDArray[np.float64], dofs: NDArray[np.int64]) -> in
     for axis in range(3):
         unit = np.eye(3)[axis]
         motion[:, 3 + axis] = np.cross(unit, centred / size)[np.arange(len(dofs)), direction]
-    # The eigenvalues of this are the squared singular values of the constraints on the motions.
+    # The eigenvalues are the squared singular values of the constraints on the motions.
     values = np.linalg.eigvalsh(motion.T @ motion)
     return int(np.count_nonzero(values <= _FREE**2 * values[-1]))
 
 
-def scene_remarks(
-    points: NDArray[np.float64],
-    cells: NDArray[np.int64],
-    domains: NDArray[np.int64],
-    n_fe_nodes: int,
-    dofs: NDArray[np.int64],
-) -> list[str]:
-    """Warnings about the whole model: separate pieces, free rigid motion, support domains of FE nodes only."""
+def scene_remarks(points: Floats, cells: Ints, domains: Ints, n_fe_nodes: int, dofs: Ints) -> list[str]:
+    """Warnings about the model: separate pieces, free rigid motion, support domains with FE nodes only."""
     piece = pieces([cells, domains], len(points))
     n_pieces = int(piece.max(initial=-1)) + 1
     found = []
@@ -155,11 +150,11 @@ def scene_remarks(
     return found
 
 
-def inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which points (n, 3) lie inside one of the hexahedra with corners (m, 8, 3); faces are taken as planes.
+def inside(points: Floats, corners: Floats) -> Bools:
+    """Which points (n, 3) lie inside one of the hexahedra with corners (m, 8, 3); faces are treated as planes.
 
-    Corners may coincide, as in a tetrahedron. A point in the plane of a face is in neither neighbour for sure, so
-    that the planes are drawn in by a millionth of the cell's size.
+    Corners may coincide, as in a tetrahedron. A point in the plane of a face counts as outside both neighbours: the
+    planes are moved inwards by a millionth of the cell's size.
     """
     if not len(corners) or not len(points):
         return np.zeros(len(points), bool)
@@ -170,7 +165,7 @@ def inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray
         x = corners[column]
         size = np.linalg.norm(x.max(axis=1) - x.min(axis=1), axis=1)
         within = np.ones(len(points), bool)
-        for a, b, c, d in ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)):
+        for a, b, c, d in FACES:
             normal = np.cross(x[:, c] - x[:, a], x[:, d] - x[:, b])
             length = np.linalg.norm(normal, axis=1)
             away = ((points - x[:, [a, b, c, d]].mean(axis=1)) * normal).sum(axis=1)
@@ -179,13 +174,13 @@ def inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray
     return found
 
 
-def enclosed_volume(points: NDArray[np.float64], faces: NDArray[np.int64]) -> float | None:
-    """Volume (m^3) within a closed surface of quadrilaterals (n, 4) that look outwards; None if it is not closed."""
+def enclosed_volume(points: Floats, faces: Ints) -> float | None:
+    """Volume, m^3, inside a closed surface of quadrilaterals (n, 4) seen from outside; None if it is not closed."""
     edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     if not len(faces) or (np.unique(edges, axis=0, return_counts=True)[1] % 2).any():
         return None
     x = points[faces] - points[faces].mean(axis=(0, 1))
-    # The mean of both ways to cut a quadrilateral in two is the volume under its bilinear surface.
+    # The volume under a bilinear surface is the mean of the two triangulations.
     volume = 0.0
     for a, b, c in ((0, 1, 2), (0, 2, 3), (0, 1, 3), (1, 2, 3)):
         volume += float((x[:, a] * np.cross(x[:, b], x[:, c])).sum()) / 12

@@ -1,48 +1,46 @@
-"""Discs, balls and what is around a ball, cut in hexahedra: a square or cube-like core and shells."""
+"""O-grids of discs and balls: a square or cube-like core and shells around it."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mpitled.mesh import grid_points, structured_hexahedra
-from mpitled.meshing.cloud import boundary_faces
+from mpitled.mesh import Bools, Floats, Ints, grid_points, structured_hexahedra
+from mpitled.meshing.faces import boundary_faces, unshared
 
-# Half the core's width over the radius, and how far the core's sides bulge towards the circle or sphere: from a search
-# for even cells whose worst corner is good (scaled Jacobian 0.85 in a cylinder, 0.71 in a ball; volumes 1 to 6 in it).
+# Half the core's width over the radius, and the bulge of the core's sides towards the circle or sphere. Both come from
+# a search for even cells with a good worst corner (scaled Jacobian 0.85 in a cylinder, 0.71 in a ball with volumes 1 to
+# 6).
 _CORE, _BULGE = 0.5, 0.4
 
 
-class Onion:
-    """A disc or ball of radius 1 cut in a square or cube-like core and shells around it.
+class OGrid:
+    """The mesh of a disc or ball of radius 1: a square or cube-like core and shells around it.
 
-    In the core, straight lines near the middle bend towards the sphere's outwards; between core and sphere, lines are
-    straight. Nodes are the core's grid, x fastest, then one shell after the other.
+    Lines of the core are straight near the middle and bend towards the sphere further out. Between core and sphere they
+    are straight. Nodes are the core's grid, x fastest, then one shell after the other.
     """
 
-    points: NDArray[np.float64]  # (n_nodes, d)
-    cells: NDArray[np.int64]  # (n_cells, 2^d), in VTK's order
-    surface: NDArray[np.int64]  # nodes on the sphere, ascending
-    cube: NDArray[np.float64]  # (n_surface, d), their places on the cube [-1, 1]^d before it was made round
-    faces: NDArray[np.int64]  # (n_faces, 2^(d-1)) rows of `surface`, seen from outside anticlockwise
+    points: Floats  # (n_nodes, d)
+    cells: Ints  # (n_cells, 2^d), in VTK's order
+    surface: Ints  # nodes on the sphere, ascending
+    cube: Floats  # (n_surface, d), the surface nodes on the cube [-1, 1]^d before the mapping
+    faces: Ints  # (n_faces, 2^(d-1)) rows of `surface`, anticlockwise seen from outside
 
     def __init__(
         self, shape: tuple[int, ...], radius: float, element_size: float, outermost: float = 1.0, lines: float = 1.0
     ) -> None:
-        """Cells along each axis of the core; the shells are as thick as suits elements of that size (both m).
+        """`shape`: cells along each axis of the core. `radius` and `element_size` (m) give the number of shells.
 
-        The outermost shell has the share `outermost` of their mean thickness. Across a ball's core, cells beside the
-        places 1/2 and 1 of the cube have the share `lines` of their mean width.
+        The outermost shell has the share `outermost` of the shells' mean thickness. Across a ball's core, cells beside
+        the coordinates 1/2 and 1 of the cube have the share `lines` of the mean width.
         """
         d = len(shape)
         nx, ny, nz = (*shape, 1)[:3]
-        grid, core_cells = (
-            grid_points((nx, ny, nz), (2.0, 2.0, 2.0))[:, :d] - 1,
-            structured_hexahedra((nx, ny, nz)),
-        )
+        grid = grid_points((nx, ny, nz), (2.0, 2.0, 2.0))[:, :d] - 1
+        core_cells = structured_hexahedra((nx, ny, nz))
         if d == 2:
             grid, core_cells = grid[: len(grid) // 2], core_cells[:, :4]
-        # Whole numbers of cells, so that the faces' places are 1 and the patch's edge 1/2 without round-off.
+        # Whole numbers of cells give the faces' coordinate 1 and the patch's edge 1/2 without round-off.
         grid = np.rint((grid + 1) / 2 * shape) * 2 / shape - 1
         grid = _crowded(grid, lines)
         level = np.abs(grid).max(axis=1)
@@ -53,14 +51,14 @@ class Onion:
         core = _CORE * level[:, None] * ((1 - bulge) * direction + bulge * on_sphere(direction))
         inner, outer = core[edge], on_sphere(self.cube)
         thickness = radius * (1 - np.linalg.norm(inner, axis=1).mean())
-        self.n_shells = number(thickness / element_size)
+        self.n_shells = whole_number(thickness / element_size)
         ends = graded(self.n_shells, outermost)
         share = ends[1:, None, None]
         self.points = np.concatenate([core, ((1 - share) * inner + share * outer).reshape(-1, d)])
 
         row = np.full(len(grid), -1)
         row[edge] = np.arange(len(edge))
-        self.faces = row[boundary_faces(core_cells) if d == 3 else _sides(core_cells)]
+        self.faces = row[boundary_faces(core_cells) if d == 3 else _boundary_edges(core_cells)]
         # Rows of the core's surface and of each shell.
         nodes = np.concatenate([edge[None], len(grid) + np.arange(self.n_shells * len(edge)).reshape(-1, len(edge))])
         self.surface = nodes[-1]
@@ -72,25 +70,25 @@ class Onion:
         self._radius = np.concatenate([_CORE * middle, _CORE + (1 - _CORE) * shell])
         self._outermost = np.arange(len(self.cells)) >= len(self.cells) - len(self.faces)
 
-    def core(self, share: float) -> NDArray[np.bool_]:
+    def core(self, share: float) -> Bools:
         """Cells (n_cells,) whose middle lies within that share of the radius, never those of the outermost shell."""
         return (self._radius <= share) & ~self._outermost
 
 
-def graded(n: int, smallest: float, both_ends: bool = False) -> NDArray[np.float64]:
-    """Ends (n + 1,) of n parts of [0, 1], whose lengths fall evenly to `smallest` of their mean at 1, or at both ends.
+def graded(n: int, smallest: float, both_ends: bool = False) -> Floats:
+    """Ends (n + 1,) of n parts of [0, 1]; their lengths fall to `smallest` times the mean at 1, or at both ends.
 
-    They are a smooth map's, so that errors fall with n as those of equal parts do.
+    The ends come from a smooth map, so errors fall with n as with equal parts.
     """
     s, cycles = np.arange(n + 1) / n, 2 if both_ends else 1
-    away = (1 - smallest) * np.sin(cycles * np.pi * s) / (cycles * np.pi)
-    ends: NDArray[np.float64] = s - away if both_ends else s + away
+    shift = (1 - smallest) * np.sin(cycles * np.pi * s) / (cycles * np.pi)
+    ends: Floats = s - shift if both_ends else s + shift
     ends[-1] = 1.0
     return ends
 
 
-def _crowded(grid: NDArray[np.float64], smallest: float) -> NDArray[np.float64]:
-    """Places (n, d) in [-1, 1]^d, equally far apart, with those beside 1/2 and 1 moved nearer to it: see `graded`."""
+def _crowded(grid: Floats, smallest: float) -> Floats:
+    """Equidistant grid points (n, d) in [-1, 1]^d, moved towards the coordinates 1/2 and 1: see `graded`."""
     if smallest == 1:
         return grid
     w = np.abs(grid)
@@ -100,22 +98,26 @@ def _crowded(grid: NDArray[np.float64], smallest: float) -> NDArray[np.float64]:
     return np.sign(grid) * np.where(exact, w, np.where(w < 0.5, inner, outer))
 
 
-def on_sphere(cube: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit vectors (n, d) of places (n, d) on the cube's surface, at equal angles for equal distances there.
+def on_sphere(cube: Floats) -> Floats:
+    """Unit vectors (n, d) of points (n, d) on the cube's surface: the equiangular map of the cubed sphere.
 
-    Ronchi, Iacono and Paolucci 1996, J. Comput. Phys. 124. Zero vectors stay.
+    Ronchi, Iacono and Paolucci 1996, J. Comput. Phys. 124. Zero vectors stay zero.
     """
     slopes = np.tan(np.pi / 4 * cube)
     return slopes / np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1e-300)
 
 
-def _sides(quads: NDArray[np.int64]) -> NDArray[np.int64]:
+def _boundary_edges(quads: Ints) -> Ints:
     """Edges (n, 2) that belong to one of the quadrilaterals (n, 4) only, in their sense of rotation."""
     edges = np.stack([quads, np.roll(quads, -1, axis=1)], axis=2).reshape(-1, 2)
-    _, first, count = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
-    return edges[np.sort(first[count == 1])]
+    return edges[unshared(edges)]
 
 
-def number(wanted: float) -> int:
-    """The whole number next to what is wanted, at least 1."""
+def shell_cells(nodes: Ints, faces: Ints) -> Ints:
+    """Hexahedra (n, 8) between successive layers of nodes (n_layers + 1, m), over faces (k, 4) that index into m."""
+    return np.concatenate([nodes[:-1][:, faces], nodes[1:][:, faces]], axis=2).reshape(-1, 8)
+
+
+def whole_number(wanted: float) -> int:
+    """The nearest whole number, but at least 1."""
     return max(1, int(np.floor(wanted + 0.5)))

@@ -1,4 +1,4 @@
-"""Phantoms: cylinders and ellipsoids of hexahedra that follow the curved surface, with a cloud in their core or not."""
+"""Phantoms: cylinders and ellipsoids of hexahedra that follow the curved surface, with or without a cloud."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpitled.errors import InputError
-from mpitled.mesh import Mesh, check_size, hexahedral_mesh
-from mpitled.meshing.cloud import in_millimetres, with_cloud
-from mpitled.meshing.o_grid import Onion, graded, number, on_sphere
+from mpitled.mesh import Bools, Floats, Ints, Mesh, check_size, hexahedral_mesh
+from mpitled.meshing.cloud import build_cloud, near_centre
+from mpitled.meshing.o_grid import OGrid, graded, on_sphere, shell_cells, whole_number
+from mpitled.meshing.placement import format_position
 
 if TYPE_CHECKING:
     from mpitled import deck
 
-# Elements over the core's width for each element's size in the radius, so that the mean edge is the size asked for.
+# Elements across the core per element size in the radius; makes the mean edge the element size asked for.
 _ACROSS = 1.1
-# A layer or shell whose middle lies at the end of the core but for round-off stays out of it.
+# Layers with their centre within this share of the core's end do not belong to it: round-off must not decide.
 _TIE = 1e-9
-# Thickness over width of the shells around a seed.
+# Thickness over width of the cells in the shells around a seed.
 _THICK = 1.5
 
 
@@ -29,31 +29,31 @@ def cylinder_mesh(
 ) -> Mesh:
     """The mesh of a cylinder along z from z = 0, a square core in rings: sets bottom, top, side and, together, surface.
 
-    A core cloud ends at the ring or layer next to `core_share` of radius and height, or, with a tumour, takes the
-    hexahedra within `cloud.radius` of its centre. InputError for a tumour without a cloud or without room.
+    A core cloud ends at the ring or layer nearest to `core_share` of radius and height. With a tumour it replaces the
+    hexahedra within `cloud.radius` of the tumour's centre. InputError for a tumour without a cloud or without room.
     """
     if tumour is not None and cylinder.cloud == "none":
         raise InputError('cylinder.cloud = "none": a tumour grows in a cloud; set it to "core" or "all"')
     size = _element_size(cylinder, cloud)
     check_size((np.pi * (cylinder.radius / size) ** 2 + 1) * (cylinder.height / size + 1), "cylinder.element_size")
-    n = 2 * number(_ACROSS * cylinder.radius / (2 * size))
-    # In a cloud there are no layers, and nodes on its surface should lie as those in it: evenly.
+    n = 2 * whole_number(_ACROSS * cylinder.radius / (2 * size))
+    # A cloud has no layers, and the nodes on its surface should be as even as those inside.
     grading = 1.0 if cylinder.cloud == "all" else cylinder.grading
-    onion = Onion((n, n), cylinder.radius, size, grading)
-    layers = number(cylinder.height / size)
-    flat = cylinder.radius * onion.points
+    o_grid = OGrid((n, n), cylinder.radius, size, grading)
+    layers = whole_number(cylinder.height / size)
+    flat = cylinder.radius * o_grid.points
     share = graded(layers, grading, both_ends=True)
     z = cylinder.height * share
     points = np.concatenate([np.tile(flat, (layers + 1, 1)), np.repeat(z, len(flat))[:, None]], axis=1)
     level = np.arange(layers)[:, None, None] * len(flat)
-    hexahedra = np.concatenate([onion.cells + level, onion.cells + level + len(flat)], axis=2).reshape(-1, 8)
+    hexahedra = np.concatenate([o_grid.cells + level, o_grid.cells + level + len(flat)], axis=2).reshape(-1, 8)
 
     nodes = np.arange(len(points)).reshape(layers + 1, -1)
-    sides = {"bottom": nodes[0], "top": nodes[-1], "side": nodes[:, onion.surface].ravel()}
+    sides = {"bottom": nodes[0], "top": nodes[-1], "side": nodes[:, o_grid.surface].ravel()}
     node_sets = sides | {"surface": np.unique(np.concatenate(list(sides.values())))}
     inside = np.abs(share[1:] + share[:-1] - 1) < cylinder.core_share - _TIE
     inside[[0, -1]] = False
-    core = (inside[:, None] & onion.core(cylinder.core_share)).ravel()
+    core = (inside[:, None] & o_grid.core(cylinder.core_share)).ravel()
     return _filled(cylinder.cloud, core, points, hexahedra, node_sets, cloud, tumour, size, spheres)
 
 
@@ -62,49 +62,49 @@ def ellipsoid_mesh(
 ) -> Mesh:
     """The mesh of an ellipsoid around the origin: a cube-like core in shells of an equiangular cubed sphere.
 
-    Sets are surface and, where with (p, q, r) = (x/a, y/b, z/c) on it r > 0, |p| <= t r, |q| <= t r, t = tan(pi/8),
-    patch; where r < 0, |p| <= -r, |q| <= -r, fixed. The numbers of elements are divisible by 4, so that both end
-    with elements. A core cloud ends at the shell next to `core_share` of the semi-axes, or, with a tumour, takes the
-    hexahedra within `cloud.radius` of its centre. Without a cloud, `cavity` says how a tumour has its seed.
-    InputError for a tumour without room.
+    Let (p, q, r) = (x/a, y/b, z/c) and t = tan(pi/8). The node sets are surface, patch (r > 0, |p| <= t r, |q| <= t r
+    on the surface) and fixed (r < 0, |p| <= -r, |q| <= -r on the surface). The numbers of elements are divisible by 4,
+    so that patch and fixed end at element edges. A core cloud ends at the shell nearest to `core_share` of the
+    semi-axes. With a tumour it replaces the hexahedra within `cloud.radius` of the tumour's centre. Without a cloud,
+    `cavity` chooses the mesh of the seed. InputError for a tumour without room.
     """
     axes, size = np.asarray(ellipsoid.semi_axes), _element_size(ellipsoid, cloud)
-    # The core, and the shells around it.
+    # Estimates of the cells in the core and in the shells around it.
     across = _ACROSS * axes / size + 4
     shells = axes.prod() ** (1 / 3) / size * 2 * (across * np.roll(across, 1)).sum()
     check_size(float(across.prod() + shells) / 4, "ellipsoid.element_size")
-    shape = np.array([4 * number(_ACROSS * a / (4 * size)) for a in axes])
+    shape = np.array([4 * whole_number(_ACROSS * a / (4 * size)) for a in axes])
     if tumour is not None and ellipsoid.cloud == "none" and ellipsoid.cavity == "fitted":
         check_size((tumour.surface_nodes / 6) ** 1.5, "tumour.surface_nodes")
-        shape = np.maximum(shape, 4 * number(np.ceil((tumour.surface_nodes / 6) ** 0.5 / 4)))
+        shape = np.maximum(shape, 4 * whole_number(np.ceil((tumour.surface_nodes / 6) ** 0.5 / 4)))
     grading = 1.0 if ellipsoid.cloud == "all" else ellipsoid.grading
-    onion = Onion(tuple(shape), float(axes.prod() ** (1 / 3)), size, grading, lines=grading)
+    o_grid = OGrid(tuple(shape), float(axes.prod() ** (1 / 3)), size, grading, lines=grading)
     node_sets = {
-        "surface": onion.surface,
-        "patch": onion.surface[(onion.cube[:, 2] == 1) & (np.abs(onion.cube[:, :2]) <= 0.5).all(axis=1)],
-        "fixed": onion.surface[onion.cube[:, 2] == -1],
+        "surface": o_grid.surface,
+        "patch": o_grid.surface[(o_grid.cube[:, 2] == 1) & (np.abs(o_grid.cube[:, :2]) <= 0.5).all(axis=1)],
+        "fixed": o_grid.surface[o_grid.cube[:, 2] == -1],
     }
-    points = axes * onion.points
+    points = axes * o_grid.points
     if tumour is None or ellipsoid.cloud != "none":
-        core = onion.core(ellipsoid.core_share)
-        return _filled(ellipsoid.cloud, core, points, onion.cells, node_sets, cloud, tumour, size, spheres)
+        core = o_grid.core(ellipsoid.core_share)
+        return _filled(ellipsoid.cloud, core, points, o_grid.cells, node_sets, cloud, tumour, size, spheres)
     _check_room(tumour, axes, size)
     if ellipsoid.cavity == "moved":
-        return _moved(points, onion.cells, node_sets, axes, np.asarray(tumour.centre))
-    return _fitted(points[onion.surface], onion, node_sets, tumour, size)
+        return _moved(points, o_grid.cells, node_sets, axes, np.asarray(tumour.centre))
+    return _fitted(points[o_grid.surface], o_grid, node_sets, tumour, size)
 
 
 def _element_size(phantom: deck.Cylinder | deck.Ellipsoid, cloud: deck.Cloud) -> float:
-    """Where the cloud replaces all, it has its boundary nodes from the elements: they follow its spacing."""
+    """The element size, m. A cloud for all hexahedra has their boundary nodes, so the elements follow its spacing."""
     return cloud.spacing if phantom.cloud == "all" and cloud.spacing else phantom.element_size
 
 
 def _filled(
     which: str,
-    core: NDArray[np.bool_],
-    points: NDArray[np.float64],
-    hexahedra: NDArray[np.int64],
-    node_sets: dict[str, NDArray[np.int64]],
+    core: Bools,
+    points: Floats,
+    hexahedra: Ints,
+    node_sets: dict[str, Ints],
     cloud: deck.Cloud,
     tumour: deck.Tumour | None,
     element_size: float,
@@ -114,70 +114,56 @@ def _filled(
     if which == "none":
         return hexahedral_mesh(points, hexahedra, node_sets)
     if which == "all":
-        dropped = np.ones(len(hexahedra), bool)
-    elif tumour is None:
-        dropped = core
-    else:
-        dropped = np.linalg.norm(points[hexahedra].mean(axis=1) - np.asarray(tumour.centre), axis=1) <= cloud.radius
-    return with_cloud(points, hexahedra, dropped, node_sets, cloud, tumour, element_size, spheres)
+        core = np.ones(len(hexahedra), bool)
+    elif tumour is not None:
+        core = near_centre(points, hexahedra, tumour, cloud.radius)
+    return build_cloud(points, hexahedra, core, node_sets, cloud, tumour, element_size, spheres).mesh
 
 
-def _check_room(tumour: deck.Tumour, axes: NDArray[np.float64], element_size: float) -> None:
-    """The seed lies inside the ellipsoid, with an element's size around it."""
+def _check_room(tumour: deck.Tumour, axes: Floats, element_size: float) -> None:
+    """InputError unless the seed, with an element's size around it, lies inside the ellipsoid."""
     centre, room = np.asarray(tumour.centre), tumour.seed_radius + element_size
     if room >= axes.min() or np.linalg.norm(centre / (axes - room)) > 1:
         raise InputError(
-            f"tumour.centre = {in_millimetres(centre)}: seed and an element's size around it leave the ellipsoid; "
-            "move it, or make tumour.seed_radius or ellipsoid.element_size smaller"
+            f"tumour.centre = {format_position(centre)}: the seed and an element's size around it do not fit into the "
+            "ellipsoid; move it, or make tumour.seed_radius or ellipsoid.element_size smaller"
         )
 
 
-def _fitted(
-    outer: NDArray[np.float64],
-    onion: Onion,
-    node_sets: dict[str, NDArray[np.int64]],
-    tumour: deck.Tumour,
-    element_size: float,
-) -> Mesh:
-    """Shells from the seed's surface, set tumour, to the ellipsoid's nodes `outer` (n, 3).
+def _fitted(outer: Floats, o_grid: OGrid, node_sets: dict[str, Ints], tumour: deck.Tumour, element_size: float) -> Mesh:
+    """Shells from the seed's surface (node set tumour) to the ellipsoid's surface nodes `outer` (n, 3).
 
-    Shells are _THICK times as thick as cells are wide, which widen with the distance to the centre, but at most an
-    element's size: growth makes them thin and wide. Lines leave the seed at right angles and turn evenly towards their
-    place on the surface.
+    The width of cells grows with the distance to the centre. Shells are _THICK times as thick as their cells are wide,
+    because growth makes them thin and wide, but at most an element's size. Lines leave the seed at right angles and
+    turn evenly towards their nodes on the surface.
     """
     centre, seed = np.asarray(tumour.centre), tumour.seed_radius
-    growth = _THICK * np.sqrt(4 * np.pi / len(onion.faces))
+    growth = _THICK * np.sqrt(4 * np.pi / len(o_grid.faces))
     reach = np.linalg.norm(outer - centre, axis=1)
-    even = max(element_size / growth, seed)  # from this distance on shells are equally thick
+    even = max(element_size / growth, seed)  # beyond this distance shells are equally thick
     ends = np.log(np.minimum(reach, even) / seed) / growth + np.maximum(reach - even, 0) / (growth * even)
-    n = number(np.ceil(ends.mean()))
-    check_size(float(n) * len(onion.faces), "ellipsoid.element_size")
+    n = whole_number(np.ceil(ends.mean()))
+    check_size(float(n) * len(o_grid.faces), "ellipsoid.element_size")
     place = ends * np.arange(n + 1)[:, None] / n  # (shells, lines), in thicknesses
     turn = np.log(even / seed) / growth
     radius = np.where(
         place < turn, seed * np.exp(growth * np.minimum(place, turn)), even * (1 + growth * (place - turn))
     )
     share = ((radius - seed) / (reach - seed))[..., None]
-    direction = (1 - share) * on_sphere(onion.cube) + share * ((outer - centre) / reach[:, None])
+    direction = (1 - share) * on_sphere(o_grid.cube) + share * ((outer - centre) / reach[:, None])
     points = centre + radius[..., None] * direction / np.linalg.norm(direction, axis=2, keepdims=True)
     points[-1] = outer
     nodes = np.arange(points[..., 0].size).reshape(n + 1, -1)
-    hexahedra = np.concatenate([nodes[:-1][:, onion.faces], nodes[1:][:, onion.faces]], axis=2).reshape(-1, 8)
-    first = onion.surface[0]
+    hexahedra = shell_cells(nodes, o_grid.faces)
+    first = o_grid.surface[0]
     node_sets = {name: nodes[-1][members - first] for name, members in node_sets.items()} | {"tumour": nodes[0]}
     return hexahedral_mesh(points.reshape(-1, 3), hexahedra, node_sets)
 
 
-def _moved(
-    points: NDArray[np.float64],
-    hexahedra: NDArray[np.int64],
-    node_sets: dict[str, NDArray[np.int64]],
-    axes: NDArray[np.float64],
-    centre: NDArray[np.float64],
-) -> Mesh:
-    """A mesh that takes no notice of the seed: the hexahedron there is the cavity, its nodes the set tumour.
+def _moved(points: Floats, hexahedra: Ints, node_sets: dict[str, Ints], axes: Floats, centre: Floats) -> Mesh:
+    """A mesh that does not follow the seed's surface: one hexahedron is the cavity, its nodes are the set tumour.
 
-    The mesh is shifted, less and less towards the surface, so that the hexahedron has its middle in the centre.
+    A shift that fades towards the surface moves the centre of this hexahedron to the tumour's centre.
     """
     middle = points[hexahedra].mean(axis=1)
     hole = int(np.linalg.norm(middle - centre, axis=1).argmin())

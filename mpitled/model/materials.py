@@ -9,7 +9,7 @@ from mpitled.deck import Deck
 from mpitled.errors import InputError
 from mpitled.laws import Material
 from mpitled.mesh import Mesh, named_set
-from mpitled.meshing import labels
+from mpitled.meshing import label_image
 
 
 def assign_materials(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int16], tuple[Material, ...]]:
@@ -19,7 +19,7 @@ def assign_materials(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int16], tuple[M
     file; materials without cells are dropped. Ventricles that the deck leaves out need no material, and may have one.
     InputError if a cell has two materials or none.
     """
-    absent = {name for name in labels.VENTRICLES if deck.labels and not getattr(deck.labels, name)}
+    absent = {name for name in label_image.VENTRICLES if deck.labels and not getattr(deck.labels, name)}
     claims = [(name, section.material) for section in deck.materials for name in section.cells if name not in absent]
     materials = list(dict.fromkeys(material for _, material in claims))
     assigned = np.full(mesh.n_cells, -1, np.int16)

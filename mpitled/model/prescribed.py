@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mpitled.deck import Deck
 from mpitled.errors import InputError
 from mpitled.mesh import Constraint, Mesh, named_set
-from mpitled.meshing.cloud import length
+from mpitled.meshing.placement import format_length
 from mpitled.model.loading import growth, rotation_path, sphere_radius
 from mpitled.model.mapping import carry_over
 from mpitled.model.scene import OUTER, TUMOUR, members
@@ -68,8 +68,8 @@ def check_growth(deck: Deck, mesh: Mesh, dofs: NDArray[np.int64], displacements:
     radius, nearest = sphere_radius(deck.tumour.volume), float(distances.min(initial=np.inf))
     if radius > nearest:
         raise InputError(
-            f"{deck.path}: tumour.volume = {1e9 * deck.tumour.volume:.10g}: its sphere of {length(radius)} radius "
-            f"reaches beyond the outer surface, which is fixed {length(nearest)} from tumour.centre; lower it"
+            f"{deck.path}: tumour.volume = {1e9 * deck.tumour.volume:.10g}: its sphere of {format_length(radius)} "
+            f"radius reaches beyond the outer surface, which is fixed {format_length(nearest)} from tumour.centre; lower it"
         )
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mpitled.deck import Deck
 from mpitled.laws import Material
 from mpitled.mesh import Mesh
-from mpitled.meshing.cloud import in_millimetres, length, looks_like_metres
+from mpitled.meshing.placement import format_length, format_position, unit_hint
 from mpitled.model.loading import sphere_radius
 from mpitled.model.scene import OUTER, TUMOUR, centroids, members
 
@@ -45,8 +45,8 @@ def unit_warnings(
     if deck.tumour is None:
         return
     centre = np.asarray(deck.tumour.centre)
-    if reason := looks_like_metres(centre, mesh.points.min(axis=0), mesh.points.max(axis=0)):
-        yield f"warning: tumour.centre = {in_millimetres(centre)}: {reason}"
+    if reason := unit_hint(centre, mesh.points.min(axis=0), mesh.points.max(axis=0)):
+        yield f"warning: tumour.centre = {format_position(centre)}: {reason}"
     tissue = materials[material[((centroids(mesh) - centre) ** 2).sum(axis=1).argmin()]]
     if tissue.youngs_modulus < MIN_MODULUS and tissue.name not in warned:
         key = f"material.{tissue.name}.youngs_modulus = {tissue.youngs_modulus:.10g}"
@@ -76,9 +76,9 @@ def growth_warnings(deck: Deck) -> Iterator[str]:
             f"warning: tumour.seed_radius = {1e3 * seed:.10g}: {share:.0%} of tumour.volume is there at the start and "
             "moves nothing, and only the rest is grown; make it smaller"
         )
-    grows = f"warning: the tumour grows to a radius of {length(radius)}"
+    grows = f"warning: the tumour grows to a radius of {format_length(radius)}"
     if radius > MAX_GROWTH * seed:
         times = f"{radius / seed:.3g} times its seed's"
         yield f"{grows}, {times}, where cells may turn inside out; enlarge tumour.seed_radius"
     if radius > deck.cloud.radius and not deck.mesh:
-        yield f"{grows}, beyond the cloud's {length(deck.cloud.radius)}; enlarge cloud.radius"
+        yield f"{grows}, beyond the cloud's {format_length(deck.cloud.radius)}; enlarge cloud.radius"

@@ -11,7 +11,7 @@ from mpitled.deck import Deck, Sphere
 from mpitled.errors import InputError
 from mpitled.mesh import Mesh
 from mpitled.meshing import block, labels, phantoms
-from mpitled.meshing.cloud import in_sphere
+from mpitled.meshing.placement import in_sphere
 
 #: Node set of the surface of the tumour's seed; the meshers make it where there is a tumour.
 TUMOUR = "tumour"

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from mpitled.deck import Deck, MeshFiles, Tumour, load_deck
 from mpitled.errors import InputError
 from mpitled.mesh import Constraint, Mesh
-from mpitled.meshing import checks, labels
-from mpitled.meshing.cloud import in_millimetres, length
+from mpitled.meshing import checks, label_image
+from mpitled.meshing.placement import format_length, format_position
 from mpitled.model import build as model_build
 from mpitled.model.loading import sphere_radius
 from mpitled.preview import forecast
-from mpitled.readers import meshes
+from mpitled.readers import meshes, solids
 from mpitled.readers.meshfile import MeshFile
 
 #: A tumour this near to the plane between left and right is in the middle, m.
@@ -54,7 +54,7 @@ def figures(path: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
 def _items(path: Path, overrides: Sequence[str]) -> Iterator[Item]:
     if path.suffix.lower() == ".toml":
         return _deck(load_deck(path, overrides))
-    if labels.is_image(path):
+    if label_image.is_image(path):
         what = f'mpitled info {path}; a deck computes it by: [labels] image = "{path.name}"'
         raise InputError(f"{path}: is an image; list its labels by: {what}")
     if overrides:
@@ -97,7 +97,7 @@ def _tumour(tumour: Tumour, mesh: Mesh, *, x_is_right: bool) -> Item:
     """Where it lies, how large it grows, and how far its centre is from the nearest nodes of what is around it."""
     centre, radius = np.asarray(tumour.centre), sphere_radius(tumour.volume)
     around = {}
-    for name in labels.VENTRICLES:
+    for name in label_image.VENTRICLES:
         cells = mesh.cell_sets.get(name, np.empty(0, np.int64))
         around[name] = mesh.points[np.unique(mesh.hexahedra[cells[cells < len(mesh.hexahedra)]])]
     for name in model_build.OUTER:
@@ -105,22 +105,22 @@ def _tumour(tumour: Tumour, mesh: Mesh, *, x_is_right: bool) -> Item:
         around[name] = mesh.points[outer.astype(np.int64)]
     around = {name: points for name, points in around.items() if len(points)}
     apart = {name: float(np.linalg.norm(points - centre, axis=1).min()) for name, points in around.items()}
-    ventricles = sorted((name for name in labels.VENTRICLES if name in apart), key=apart.__getitem__)
+    ventricles = sorted((name for name in label_image.VENTRICLES if name in apart), key=apart.__getitem__)
 
     across = float(centre[0] - (mesh.points[:, 0].min() + mesh.points[:, 0].max()) / 2)
     if len(ventricles) == 2:
-        left, right = (around[name][:, 0].mean() for name in labels.VENTRICLES)
+        left, right = (around[name][:, 0].mean() for name in label_image.VENTRICLES)
         across *= 1 if left < right else -1
     elif not x_is_right:  # nobody knows
         across = 0.0
     side = "" if abs(across) < _MIDDLE else "right" if across > 0 else "left"
     told = [*ventricles[:1], *(name for name in model_build.OUTER if name in apart)]
-    text = f"{in_millimetres(centre)}{side and f', {side} of the middle'}"
+    text = f"{format_position(centre)}{side and f', {side} of the middle'}"
     grown = tumour.volume - 4 / 3 * np.pi * tumour.seed_radius**3
     text += f"; {1e9 * tumour.volume:.10g} mm3, {1e9 * grown:.5g} of it grown, radius {1e3 * tumour.seed_radius:g} -> "
-    text += length(radius)
+    text += format_length(radius)
     if told:
-        text += "; " + ", ".join(f"{length(apart[name])} from the {name.replace('_', ' ')}" for name in told)
+        text += "; " + ", ".join(f"{format_length(apart[name])} from the {name.replace('_', ' ')}" for name in told)
     figures = {
         "centre_mm": (1e3 * centre).tolist(),
         "side": side,
@@ -173,9 +173,9 @@ def _file_checks(file: MeshFile) -> Iterator[str]:
         said = checks.scene_remarks(mesh.points, mesh.hexahedra, none, mesh.n_fe_nodes, dofs)
         yield from said if len(dofs) else [remark for remark in said if "rigid" not in remark]
     else:
-        meshes.check_solids(file)
+        solids.check_solids(file)
         yield from file.remarks
-        yield from meshes.check_cloud(file)
+        yield from solids.check_cloud(file)
         yield (
             f"warning: {file.path}: has {'no hexahedra' if 'hexahedron' not in kinds else 'more than hexahedra'}; it "
             "may be mesh.efg" + (", and mesh.fe if mesh.dropped names the rest" if "hexahedron" in kinds else "")

@@ -1,7 +1,7 @@
 """Abaqus decks (.inp), as Abaqus/CAE, HyperMesh, Cubit, gmsh and CalculiX write them.
 
-Keywords that do not matter to an elastic solid with prescribed displacements are skipped, and listed if not every deck
-has them; those that change its mechanics and cannot be computed are kept as `MeshFile.refused`.
+Keywords without influence on an elastic solid with prescribed displacements are skipped; a remark lists those that not
+every deck has. Keywords that change the mechanics and cannot be computed are entered in `MeshFile.refused`.
 """
 
 from __future__ import annotations
@@ -10,35 +10,36 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpitled.errors import InputError
-from mpitled.readers import meshfile
+from mpitled.mesh import Floats, Ints
+from mpitled.readers import meshfile, text
 from mpitled.readers.assembly import Definitions, Entry, Material, Model, Scope, Set
 from mpitled.readers.inp import COMMENT, Keyword, collect, fields
-from mpitled.readers.meshfile import Block, Cells, MeshFile, where
+from mpitled.readers.meshfile import Cells, MeshFile
+from mpitled.readers.text import Block, where
 
 _SOLID = re.compile(r"C3D(\d+)[A-Z]*")
-#: The kind of solid that the first nodes of a row of so many are; "other" where nodes between the corners matter.
+#: Kind of solid by its number of nodes; "other" where nodes between the corners matter.
 _SOLIDS = {
     4: "tetrahedron", 5: "pyramid", 6: "wedge", 8: "hexahedron", 10: "tetrahedron",
     15: "other", 20: "other", 27: "other",
 }  # fmt: skip
 
-#: Keywords, without blanks, that every deck has and nobody misses: titles, output, and the solution of a step.
+#: Keywords, without blanks, that are skipped without a remark: titles, output, and the solution of a step.
 _HARMLESS = {
     "HEADING", "PREPRINT", "STATIC", "ENDSTEP", "RESTART", "OUTPUT", "NODEOUTPUT", "ELEMENTOUTPUT", "CONTACTOUTPUT",
     "ENERGYOUTPUT", "NODEPRINT", "ELPRINT", "CONTACTPRINT", "ENERGYPRINT", "NODEFILE", "ELFILE", "CONTACTFILE",
     "FILEFORMAT", "MONITOR",
 }  # fmt: skip
-#: Keywords that tie, load or move parts in ways that are not computed; what begins with CONTACT too.
+#: Keywords that tie, load or move parts in ways that cannot be computed, beside CONTACT... and CONNECTOR...
 _REFUSED = {
     "TIE", "MPC", "EQUATION", "COUPLING", "KINEMATICCOUPLING", "DISTRIBUTINGCOUPLING", "RIGIDBODY", "EMBEDDEDELEMENT",
     "SHELLTOSOLIDCOUPLING", "TRANSFORM", "SPRING", "DASHPOT", "MASS", "ROTARYINERTIA", "CONNECTORSECTION",
     "MODELCHANGE", "SUBMODEL", "CYCLICSYMMETRYMODEL", "FASTENER", "PRE-TENSIONSECTION", "GAP", "JOINT", "RELEASE",
     "IMPERFECTION", "USERELEMENT", "MATRIXASSEMBLE", "BASEMOTION",
 }  # fmt: skip
-#: Keywords that make nodes or elements out of others.
+#: Keywords that generate nodes or elements from others.
 _GENERATING = {
     "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYMMETRICMODELGENERATION", "IMPORT", "SUBSTRUCTUREPROPERTY",
 }  # fmt: skip
@@ -46,7 +47,7 @@ _GENERATING = {
 _LOADS = {
     "CLOAD", "DLOAD", "DSLOAD", "TEMPERATURE", "INITIALCONDITIONS", "FOUNDATION", "INERTIARELIEF", "CFLUX", "DFLUX",
 }  # fmt: skip
-#: Material options of other solids than elastic or neo-Hookean ones.
+#: Options of materials that are neither linear elastic nor neo-Hookean.
 _INELASTIC = {
     "PLASTIC", "VISCOELASTIC", "HYPERFOAM", "MOHRCOULOMB", "DRUCKERPRAGER", "CREEP", "USERMATERIAL", "CONCRETE",
     "HYPOELASTIC", "CLAYPLASTICITY", "CAPPLASTICITY", "CRUSHABLEFOAM", "DAMAGEINITIATION", "POROUSELASTIC",
@@ -56,15 +57,14 @@ _INELASTIC = {
 
 
 def read(path: Path) -> MeshFile:
-    """The mesh of an Abaqus deck. InputError, with file and line, for all that is wrong with it."""
+    """The mesh of an Abaqus deck. InputError, with file and line, if the deck is wrong."""
     return _Reader(path).read()
 
 
 def files(path: Path) -> list[Path]:
     """The deck and all files that it includes."""
-    found: list[Keyword] = []
     opened: list[Path] = []
-    collect(path, path.parent, found, (), opened)
+    collect(path, path.parent, [], (), opened)
     return opened
 
 
@@ -82,27 +82,26 @@ class _Reader:
         collect(path, path.parent, self.keywords, (), [])
         self.found = Definitions(path)
         self.scope = self.found.root
-        self.system: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None  # rotation, origin
+        self.system: tuple[Floats, Floats] | None = None  # rotation, origin
         self.material: Material | None = None
         self.step = 0
         self.skipped: dict[str, None] = {}
 
     def read(self) -> MeshFile:
         for keyword in self.keywords:
-            self._take(keyword)
+            self._handle(keyword)
             if keyword.name in ("NODE", "ELEMENT"):
-                keyword.data.clear()  # the text is not needed any more
+                keyword.data.clear()  # frees the text
         self.keywords.clear()
         if self.scope is not self.found.root:
             kind = "PART" if any(self.scope is part for part in self.found.parts.values()) else "INSTANCE"
             self.found.unended = f"*{kind} {self.scope.name}"
         if self.skipped:
-            self.found.remarks.append(
-                f"{self.found.path}: skipped, for nothing here depends on it: {meshfile.listed(self.skipped, 40)}"
-            )
+            skipped = meshfile.listed(self.skipped, 40)
+            self.found.remarks.append(f"{self.found.path}: skipped, because the results do not depend on it: {skipped}")
         return Model(self.found).file()
 
-    def _take(self, keyword: Keyword) -> None:
+    def _handle(self, keyword: Keyword) -> None:
         name = keyword.name
         handler = getattr(self, f"_{name.lower()}", None) if name in _HANDLED else None
         if handler:
@@ -112,9 +111,11 @@ class _Reader:
         elif name in _REFUSED or name.startswith(("CONTACT", "CONNECTOR")):
             self.found.refused.append(f"{keyword.origin}: {keyword.shown} changes the mechanics and cannot be computed")
         elif name in _GENERATING:
-            keyword.fail("makes nodes or elements out of others; let the preprocessor write them out")
+            keyword.fail("generates nodes or elements from others; let the preprocessor write them out")
         elif name in _LOADS:
-            self.found.remarks.append(f"warning: {keyword.origin}: {keyword.shown} is not applied, as no load is")
+            self.found.remarks.append(
+                f"warning: {keyword.origin}: {keyword.shown} is not applied: loads are not supported"
+            )
         elif name in _INELASTIC:
             if self.material:
                 self.material.unusable = self.material.unusable or f"has {keyword.shown} ({keyword.origin})"
@@ -138,21 +139,19 @@ class _Reader:
         self.scope = self.found.root
 
     def _instance(self, keyword: Keyword) -> None:
-        if keyword.flag("LIBRARY"):
+        if "LIBRARY" in keyword.parameters:
             keyword.fail("takes its part from a library; write the part into the deck")
         part, name = keyword.need("PART"), keyword.need("NAME")
         if part.casefold() not in self.found.parts:
             keyword.fail(f"names part {part}, which the deck does not define")
         if name.casefold() in self.found.instances:
-            keyword.fail(f"is a second one of the name {name}; rename one")
-        self.scope = self.found.instances[name.casefold()] = Scope(name)
-        self.scope.copy_from(self.found.parts[part.casefold()])
+            keyword.fail(f"is a second instance with the name {name}; rename one")
+        self.scope = self.found.instances[name.casefold()] = self.found.parts[part.casefold()].copy(name)
+        self.found.instanced.add(part.casefold())
         rows = keyword.numbers(2)
-        keyword.data.clear()
-        self.scope.points = [_moved(points, rows) for points in self.scope.points]
+        self.scope.nodes.points = [_transformed(points, rows) for points in self.scope.nodes.points]
 
-    def _endinstance(self, keyword: Keyword) -> None:
-        self.scope, self.system = self.found.root, None
+    _endinstance = _endpart
 
     # Nodes, elements and sets
 
@@ -170,32 +169,28 @@ class _Reader:
             first = along - origin
             third = np.cross(first, beside - origin) if len(given) > 6 else np.cross(first, [-first[1], first[0], 0])
             if not (first.any() and third.any()):
-                keyword.fail("has its points in one line; correct them")
+                keyword.fail("has collinear points; correct them")
             first, third = first / np.linalg.norm(first), third / np.linalg.norm(third)
             self.system = np.stack([first, np.cross(third, first), third]), origin
 
     def _node(self, keyword: Keyword) -> None:
         tables = []
         for block in keyword.data:
-            values, counts = meshfile.separated(block, float, COMMENT.encode(), blank=0.0)
-            tables.append(meshfile.table(values, counts, 4))
+            values, counts = text.separated(block, float, COMMENT, blank=0.0)
+            tables.append(text.table(values, counts, 4))
         rows = np.concatenate(tables) if tables else np.empty((0, 4))
         ids = meshfile.as_ids(rows[:, 0], "node", keyword.origin)
         points = _cartesian(rows[:, 1:], keyword)
         if self.system:
             points = points @ self.system[0] + self.system[1]
-        scope = self.scope
-        scope.node_origins.append((sum(map(len, scope.ids)), keyword.origin))
-        scope.ids.append(ids)
-        scope.points.append(points)
+        self.scope.nodes.add(ids, points, keyword.origin)
         if name := keyword.parameters.get("NSET"):
-            scope.add("node", name, Entry("labels", ids, None, keyword.origin))
+            self.scope.add("node", name, Entry("labels", ids, None, keyword.origin))
 
     def _element(self, keyword: Keyword) -> None:
         kind_name = keyword.need("TYPE")
-        parts = [meshfile.separated(block, int, COMMENT.encode()) for block in keyword.data]
-        values = np.concatenate([np.empty(0, np.int64), *(part[0] for part in parts)])
-        counts = np.concatenate([np.empty(0, np.int64), *(part[1] for part in parts)])
+        parts = [text.separated(block, int, COMMENT) for block in keyword.data]
+        values, counts = (meshfile.joined(part[i] for part in parts) for i in (0, 1))
         del parts
         match = _SOLID.fullmatch(kind_name.upper())
         n_nodes = int(match[1]) if match else 0
@@ -210,7 +205,7 @@ class _Reader:
                 )
         else:
             kind = "other"
-            rows = meshfile.table(values, counts, int(counts.max(initial=1)), -1)
+            rows = text.table(values, counts, int(counts.max(initial=1)), -1)
             nodes = rows[:, 1:]
         ids = meshfile.checked_ids(rows[:, 0], "element", keyword.origin).copy()
         self.scope.cells.append(Cells(kind, kind_name, ids, nodes, keyword.origin))
@@ -228,9 +223,9 @@ class _Reader:
     def _any_set(self, keyword: Keyword, kind: str, name: str) -> None:
         instance = keyword.parameters.get("INSTANCE")
         self.scope.sets[kind].setdefault(name.casefold(), Set(name))
-        if keyword.flag("GENERATE"):
+        if "GENERATE" in keyword.parameters:
             for origin, entries in keyword.rows():
-                first, last, step = (meshfile.integer(e or "1", origin) for e in [*entries, "", "", ""][:3])
+                first, last, step = (text.integer(e or "1", origin) for e in [*entries, "", "", ""][:3])
                 last = last if len(entries) > 1 else first
                 if step < 1 or last < first:
                     raise InputError(f"{origin}: {first}, {last}, {step} is no range; give first, last, increment")
@@ -239,16 +234,15 @@ class _Reader:
             return
         for block in keyword.data:
             for line, chunk in block.chunks():
-                found = meshfile.numbers_at_once(chunk, int, COMMENT.encode())
+                found = text.parse(chunk, int, COMMENT)
                 if found:
                     self.scope.add(kind, name, Entry("labels", found[0], instance, keyword.origin))
                     continue
-                part = Block(block.path, line, chunk, 0, len(chunk))
-                for at, text in part.lines(COMMENT):
+                for at, words in Block.of(block.path, line, chunk).lines(COMMENT):
                     origin = where(block.path, at)
-                    for entry in filter(None, fields(text)):
+                    for entry in filter(None, fields(words)):
                         if entry.isdecimal():
-                            labels = np.array([meshfile.integer(entry, origin)])
+                            labels = np.array([text.integer(entry, origin)])
                             meshfile.checked_ids(labels, kind, origin)
                             self.scope.add(kind, name, Entry("labels", labels, instance, origin))
                         else:
@@ -267,36 +261,39 @@ class _Reader:
         name = keyword.need("NAME")
         self.material = self.found.materials[name.casefold()] = Material(name, keyword.origin)
 
-    def _elastic(self, keyword: Keyword) -> None:
+    def _current_material(self, keyword: Keyword) -> Material:
         if not self.material:
-            keyword.fail("belongs to no *MATERIAL; put that above it")
+            keyword.fail("belongs to no *MATERIAL; put one above it")
+        return self.material
+
+    def _elastic(self, keyword: Keyword) -> None:
+        material = self._current_material(keyword)
         if keyword.parameters.get("TYPE", "ISOTROPIC")[:3].upper() != "ISO":
-            self.material.unusable = f"has {keyword.shown}, TYPE={keyword.parameters['TYPE']} ({keyword.origin})"
+            material.unusable = f"has {keyword.shown}, TYPE={keyword.parameters['TYPE']} ({keyword.origin})"
             return
         rows = keyword.numbers(2)
         if not rows:
             keyword.fail("has no line with Young's modulus and Poisson's ratio")
         if len(rows) > 1:
-            self.found.remarks.append(f"warning: {keyword.origin}: only the first row of {keyword.shown} is taken")
-        self.material.elastic = rows[0][1][0], (*rows[0][1], 0.0)[1]
+            self.found.remarks.append(f"warning: {keyword.origin}: only the first row of {keyword.shown} is used")
+        material.elastic = rows[0][1][0], (*rows[0][1], 0.0)[1]
 
     def _hyperelastic(self, keyword: Keyword) -> None:
-        if not self.material:
-            keyword.fail("belongs to no *MATERIAL; put that above it")
-        if not keyword.flag("NEOHOOKE") or keyword.flag("TESTDATAINPUT"):
-            self.material.unusable = f"has {keyword.shown} other than NEO HOOKE with constants ({keyword.origin})"
+        material = self._current_material(keyword)
+        if "NEOHOOKE" not in keyword.parameters or "TESTDATAINPUT" in keyword.parameters:
+            material.unusable = f"has {keyword.shown} other than NEO HOOKE with constants ({keyword.origin})"
             return
         rows = keyword.numbers(1)
         c10, d1 = ([*rows[0][1], 0.0, 0.0] if rows else [0.0, 0.0])[:2]
         if c10 <= 0 or d1 <= 0:
-            what = "incompressible, D1 = 0" if c10 > 0 and d1 == 0 else f"C10 = {c10:g}, D1 = {d1:g}"
-            self.material.unusable = f"is {what} ({keyword.origin})"
+            problem = "is incompressible, D1 = 0" if c10 > 0 and d1 == 0 else f"has C10 = {c10:g}, D1 = {d1:g}"
+            material.unusable = f"{problem} ({keyword.origin})"
             return
         mu, bulk = 2 * c10, 2 / d1
-        self.material.elastic = 9 * bulk * mu / (3 * bulk + mu), (3 * bulk - 2 * mu) / (6 * bulk + 2 * mu)
+        material.elastic = 9 * bulk * mu / (3 * bulk + mu), (3 * bulk - 2 * mu) / (6 * bulk + 2 * mu)
         self.found.remarks.append(
-            f"{keyword.origin}: material {self.material.name} has E = {self.material.elastic[0]:.6g} and nu = "
-            f"{self.material.elastic[1]:.6g} from C10 and D1, by mu = 2 C10 and K = 2/D1 at small strain"
+            f"{keyword.origin}: material {material.name} has E = {material.elastic[0]:.6g} and nu = "
+            f"{material.elastic[1]:.6g} from C10 and D1, by mu = 2 C10 and K = 2/D1 at small strain"
         )
 
     def _density(self, keyword: Keyword) -> None:
@@ -316,10 +313,10 @@ class _Reader:
 
     def _boundary(self, keyword: Keyword) -> None:
         kind = keyword.parameters.get("TYPE", "DISPLACEMENT").upper()
-        if kind != "DISPLACEMENT" or keyword.flag("USER") or keyword.flag("SUBMODEL"):
+        if kind != "DISPLACEMENT" or {"USER", "SUBMODEL"} & keyword.parameters.keys():
+            how = f"TYPE={kind}" if "TYPE" in keyword.parameters else "USER"
             self.found.refused.append(
-                f"{keyword.origin}: {keyword.shown} prescribes by {'TYPE=' + kind if keyword.flag('TYPE') else 'USER'}"
-                "; only displacements can be prescribed"
+                f"{keyword.origin}: {keyword.shown} prescribes by {how}; only displacements can be prescribed"
             )
             return
         if keyword.parameters.get("OP", "").upper() == "NEW":
@@ -335,25 +332,25 @@ _HANDLED = {
 }  # fmt: skip
 
 
-def _moved(points: NDArray[np.float64], rows: list[tuple[str, list[float]]]) -> NDArray[np.float64]:
-    """Points of an instance: translated by its first line of data, then turned about an axis by its second."""
+def _transformed(points: Floats, rows: list[tuple[str, list[float]]]) -> Floats:
+    """Points of an instance: the first line of its data is a translation, the second a rotation about an axis."""
     if rows:
         points = points + np.array([*rows[0][1], 0.0, 0.0, 0.0])[:3]
     if len(rows) > 1:
         origin, values = rows[1]
         axis = np.array(values[3:6]) - np.array(values[:3]) if len(values) == 7 else np.zeros(3)
         if not axis.any():
-            raise InputError(f"{origin}: a rotation has two points of its axis and an angle; correct it")
+            raise InputError(f"{origin}: a rotation needs two points on its axis and an angle; correct it")
         x, y, z = axis / np.linalg.norm(axis)
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         angle = np.radians(values[6])
-        turn = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-        points = (points - values[:3]) @ turn.T + values[:3]
+        rotation = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+        points = (points - values[:3]) @ rotation.T + values[:3]
     return points
 
 
-def _cartesian(points: NDArray[np.float64], keyword: Keyword) -> NDArray[np.float64]:
-    """Points of *NODE, SYSTEM=R, C (r, theta, z) or S (r, theta, phi; latitude), angles in degrees."""
+def _cartesian(points: Floats, keyword: Keyword) -> Floats:
+    """Points of *NODE in SYSTEM=R, C (r, theta, z) or S (r, theta, phi = latitude), with angles in degrees."""
     system = keyword.parameters.get("SYSTEM", "R").upper()
     if system == "R":
         return points
@@ -364,11 +361,11 @@ def _cartesian(points: NDArray[np.float64], keyword: Keyword) -> NDArray[np.floa
     if system == "S":
         phi = np.radians(last)
         return r[:, None] * np.stack([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)], axis=1)
-    keyword.fail(f"has SYSTEM={system}; there are R, C and S")
+    keyword.fail(f"has SYSTEM={system}; give R, C or S")
 
 
-def _regular(values: NDArray[np.int64], counts: NDArray[np.int64], width: int, keyword: Keyword) -> NDArray[np.int64]:
-    """Rows (n, width) of elements, each on one or more lines of its own."""
+def _regular(values: Ints, counts: Ints, width: int, keyword: Keyword) -> Ints:
+    """Rows (n, width) of elements; each row begins a new line and may continue on further lines."""
     ends = np.cumsum(counts)
     at_end = ends % width == 0
     if len(values) % width or np.count_nonzero(at_end) * width != len(values):

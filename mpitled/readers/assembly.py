@@ -1,4 +1,4 @@
-"""What an Abaqus deck defines, in its place: instances, sets by name, surfaces, sections and boundary conditions."""
+"""The content of an Abaqus deck, resolved: instances, sets by name, surfaces, sections and boundary conditions."""
 
 from __future__ import annotations
 
@@ -9,24 +9,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpitled.errors import InputError
-from mpitled.mesh import Constraint
+from mpitled.mesh import Constraint, Floats, Ints
 from mpitled.readers import meshfile
 from mpitled.readers.inp import Keyword
-from mpitled.readers.meshfile import Cells, FileMaterial, MeshFile, Numbering
+from mpitled.readers.meshfile import Cells, FileMaterial, MeshFile, NodeTable, Numbering
+from mpitled.readers.text import integer, real
 
 #: Degrees of freedom by name.
 _SYMBOLIC = {
     "ENCASTRE": (1, 2, 3), "PINNED": (1, 2, 3), "XSYMM": (1,), "YSYMM": (2,), "ZSYMM": (3,),
     "XASYMM": (2, 3), "YASYMM": (1, 3), "ZASYMM": (1, 2), "NOWARP": (), "NOOVAL": (), "NODEFORM": (),
 }  # fmt: skip
+_NOUN = {"node": "node", "cell": "element"}
+#: Scope, kind ("node" or "cell") and name of a set.
+_Key = tuple[str, str, str]
 
 
 @dataclass(slots=True)
 class Entry:
-    """What a line or a keyword adds to a set: numbers, a range (first, last, step), or another set."""
+    """An addition to a set: numbers, a range (first, last, step), or another set."""
 
     kind: str  # "labels", "range", "set", or "cells": the nodes of an element set
     value: Any
@@ -36,7 +39,7 @@ class Entry:
 
 @dataclass(slots=True)
 class Set:
-    """A set of nodes or elements as the deck gives it, bit by bit."""
+    """A set of nodes or elements as the entries of the deck."""
 
     name: str  # as first written
     entries: list[Entry] = field(default_factory=list)
@@ -44,74 +47,81 @@ class Set:
 
 @dataclass(slots=True)
 class Scope:
-    """What a part, an instance or the rest of the deck defines. Names are looked up without regard to case."""
+    """The definitions of a part, of an instance, or of the deck outside of these. Names ignore case."""
 
     name: str = ""
-    ids: list[NDArray[np.int64]] = field(default_factory=list)
-    points: list[NDArray[np.float64]] = field(default_factory=list)
-    node_origins: list[tuple[int, str]] = field(default_factory=list)  # first row of each block, and where it is
+    nodes: NodeTable = field(default_factory=NodeTable)
     cells: list[Cells] = field(default_factory=list)  # with the file's numbers as nodes
     sets: dict[str, dict[str, Set]] = field(default_factory=lambda: {"node": {}, "cell": {}})
     surfaces: dict[str, tuple[str, list[tuple[str, list[str]]]]] = field(default_factory=dict)
     sections: list[tuple[str, str, str]] = field(default_factory=list)  # set, material or "", origin
 
     def add(self, kind: str, name: str, entry: Entry) -> None:
+        """Add an entry to a set."""
         self.sets[kind].setdefault(name.casefold(), Set(name)).entries.append(entry)
 
-    def copy_from(self, part: Scope) -> None:
-        """Take over what the part defines."""
-        self.ids += part.ids
-        self.points += part.points
-        self.node_origins += part.node_origins
-        self.cells += part.cells
-        for kind in ("node", "cell"):
-            for key, members in part.sets[kind].items():
-                self.sets[kind][key] = Set(members.name, list(members.entries))
-        self.surfaces |= part.surfaces
-        self.sections += part.sections
+    def copy(self, name: str) -> Scope:
+        """An instance of this part."""
+        nodes = NodeTable(list(self.nodes.ids), list(self.nodes.points), list(self.nodes.origins))
+        sets = {
+            kind: {key: Set(members.name, list(members.entries)) for key, members in several.items()}
+            for kind, several in self.sets.items()
+        }
+        return Scope(name, nodes, list(self.cells), sets, dict(self.surfaces), list(self.sections))
 
 
 @dataclass(slots=True)
 class Placed:
-    """A scope in its place in the model: where its nodes and elements start, and their numbers."""
+    """A scope in the model: the rows of its first node and element, and their numbers."""
 
     scope: Scope
     node_offset: int
     cell_offset: int
     nodes: Numbering
     cells: Numbering
-    node_ids: NDArray[np.int64]
 
 
 @dataclass(slots=True)
 class Material:
-    """What the options under *MATERIAL say."""
+    """The options under *MATERIAL."""
 
     name: str
     origin: str
     elastic: tuple[float, float] | None = None
     density: float | None = None
-    unusable: str = ""  # why, if another law is asked for
+    unusable: str = ""  # the reason, if another law is asked for
 
 
 @dataclass(slots=True)
 class Definitions:
-    """All that the keywords of a deck define."""
+    """All definitions of a deck."""
 
     path: Path
     root: Scope = field(default_factory=Scope)
     parts: dict[str, Scope] = field(default_factory=dict)
     instances: dict[str, Scope] = field(default_factory=dict)
+    instanced: set[str] = field(default_factory=set)  # parts with an instance
     assembly: str = ""  # its name
-    unended: str = ""  # the part or instance that the text ends in
+    unended: str = ""  # the part or instance without an end
     materials: dict[str, Material] = field(default_factory=dict)
-    boundaries: list[tuple[int, Keyword]] = field(default_factory=list)  # with the step that each is in, from 1
+    boundaries: list[tuple[int, Keyword]] = field(default_factory=list)  # with the step of each, from 1
     remarks: list[str] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
 
 
+def _with_rows(block: Cells, numbering: Numbering, offset: int) -> Cells:
+    """Elements with rows of the model's nodes instead of numbers. Missing nodes are errors in solids only."""
+    if block.kind != "other":
+        nodes = numbering.resolve(block.nodes, block.ids, block.origin)
+        nodes += offset
+    else:
+        rows, found = numbering.rows(block.nodes)
+        nodes = np.where(found, rows + offset, -1)
+    return Cells(block.kind, block.type, block.ids, nodes, block.origin)
+
+
 class Model:
-    """The parts in their places, and all names looked up."""
+    """The instances of all parts, and all names resolved."""
 
     def __init__(self, given: Definitions) -> None:
         self.given = given
@@ -119,35 +129,33 @@ class Model:
         self.placed: dict[str, Placed] = {}
         points, ids, cells = [np.empty((0, 3))], [np.empty(0, np.int64)], []
         n_nodes = n_cells = 0
-        for part in given.parts.values():  # its instances have them
-            part.cells.clear()
-            part.points.clear()
+        unused = {
+            part.name: sum(map(len, part.nodes.ids))
+            for key, part in given.parts.items()
+            if part.nodes.ids and key not in given.instanced
+        }
+        given.parts.clear()  # the instances have copies
         for key, scope in {"": given.root, **given.instances}.items():
-            own_ids = np.concatenate([np.empty(0, np.int64), *scope.ids])
-            own_points = np.concatenate([np.empty((0, 3)), *scope.points])
-            scope.points.clear()
-            own_ids, own_points, remarks = meshfile.without_repeats(own_ids, own_points, scope.node_origins)
-            self.remarks += [f"{given.path}: {remark}" for remark in remarks]
-            numbering = Numbering(own_ids)
-            meshfile.check_unique_cells(scope.cells, range(len(scope.cells)))
-            own_cells = np.concatenate([np.empty(0, np.int64), *(block.ids for block in scope.cells)])
-            self.placed[key] = Placed(scope, n_nodes, n_cells, numbering, Numbering(own_cells), own_ids)
+            own_ids, own_points = scope.nodes.merged(given.path, self.remarks)
+            scope.nodes = NodeTable()  # frees memory
+            meshfile.check_unique_cells(scope.cells)
+            own_cells = meshfile.joined(block.ids for block in scope.cells)
+            placed = Placed(scope, n_nodes, n_cells, Numbering(own_ids), Numbering(own_cells))
+            self.placed[key] = placed
             for at, block in enumerate(scope.cells):
-                cells.append(self._with_rows(block, numbering, n_nodes))
+                cells.append(_with_rows(block, placed.nodes, n_nodes))
                 scope.cells[at] = cells[-1]  # frees the numbers
             points.append(own_points)
             ids.append(own_ids)
             n_nodes, n_cells = n_nodes + len(own_ids), n_cells + len(own_cells)
-        unused = {part.name: sum(map(len, part.ids)) for part in given.parts.values() if not self._instanced(part)}
-        unused = {name: n_nodes for name, n_nodes in unused.items() if n_nodes}
+        unused = {name: n for name, n in unused.items() if n}
         ends = f"the file ends within {given.unended}: is it cut short?" if given.unended else ""
         if unused and not n_nodes:
             name, n = next(iter(unused.items()))
             raise InputError(f"{given.path}: part {name}, which has {n} nodes, has no *INSTANCE; {ends or 'add one'}")
         if unused:
-            self.remarks.append(
-                f"warning: {given.path}: part {meshfile.listed(unused)} is in no *INSTANCE, so not there"
-            )
+            names = meshfile.listed(unused)
+            self.remarks.append(f"warning: {given.path}: part {names} has no *INSTANCE and is left out")
         if ends:
             self.remarks.append(f"warning: {given.path}: {ends}")
         self.mesh = MeshFile(
@@ -159,26 +167,12 @@ class Model:
             remarks=self.remarks,
             refused=given.refused,
         )
-        self.cell_starts = np.cumsum([0, *(len(block.ids) for block in cells)])
-        self._found: dict[tuple[str, str, str], NDArray[np.int64]] = {}
-
-    def _instanced(self, part: Scope) -> bool:
-        return any(part.ids and part.ids[0] is ids for scope in self.given.instances.values() for ids in scope.ids)
-
-    @staticmethod
-    def _with_rows(block: Cells, numbering: Numbering, offset: int) -> Cells:
-        """Elements with rows of the whole file's nodes in place of numbers. Unknown ones only matter to solids."""
-        if block.kind != "other":
-            nodes = meshfile.resolved(block.nodes, numbering, block.ids, block.origin)
-            nodes += offset
-        else:
-            rows, found = numbering.rows(block.nodes)
-            nodes = np.where(found, rows + offset, -1)
-        return Cells(block.kind, block.type, block.ids, nodes, block.origin)
+        self._found: dict[_Key, Ints] = {}
 
     def file(self) -> MeshFile:
+        """The mesh with all sets, materials and constraints."""
         mesh = self.mesh
-        names: dict[tuple[str, str, str], str] = {}  # place, kind, set -> name in the result
+        names: dict[_Key, str] = {}  # names of sets in the result
         for kind, sets in (("node", mesh.node_sets), ("cell", mesh.cell_sets)):
             all_names = [key for place in self.placed.values() for key in place.scope.sets[kind]]
             for key, place in self.placed.items():
@@ -199,22 +193,17 @@ class Model:
 
     # Sets
 
-    def _members(self, key: str, kind: str, name: str, within: tuple[tuple[str, str, str], ...]) -> NDArray[np.int64]:
-        """Rows of a set, ascending; `name` is one of the scope's."""
+    def _members(self, key: str, kind: str, name: str, within: tuple[_Key, ...]) -> Ints:
+        """Rows, ascending, of the set `name` of a scope."""
         at = key, kind, name
         if at not in self._found:
-            found = [np.empty(0, np.int64)]
+            entries = self.placed[key].scope.sets[kind][name].entries
             if at in within:
-                entry = self.placed[key].scope.sets[kind][name].entries[0]
-                raise InputError(f"{entry.origin}: set {name} is a part of itself; break the circle")
-            for entry in self.placed[key].scope.sets[kind][name].entries:
-                found.append(self._entry(key, kind, name, entry, (*within, at)))
-            self._found[at] = np.unique(np.concatenate(found))
+                raise InputError(f"{entries[0].origin}: set {name} is a part of itself; break the circle")
+            self._found[at] = meshfile.union(self._entry(key, kind, name, entry, (*within, at)) for entry in entries)
         return self._found[at]
 
-    def _entry(
-        self, key: str, kind: str, name: str, entry: Entry, within: tuple[tuple[str, str, str], ...]
-    ) -> NDArray[np.int64]:
+    def _entry(self, key: str, kind: str, name: str, entry: Entry, within: tuple[_Key, ...]) -> Ints:
         if entry.instance is not None:
             key = entry.instance.casefold()
             if key not in self.placed or not key:
@@ -222,32 +211,22 @@ class Model:
         if entry.kind == "set":
             return self._refer(key, kind, entry.value, entry.origin, within)
         if entry.kind == "cells":
-            return self._nodes_of(self._refer(key, "cell", entry.value, entry.origin, within))
+            return self.mesh.nodes_of(self._refer(key, "cell", entry.value, entry.origin, within))
         numbering, offset = self._numbering(key, kind)
         if entry.kind == "range":
             return offset + numbering.between(*entry.value)
-        rows, found = numbering.rows(entry.value)
-        if not found.all():
-            unknown = entry.value[~found]
-            self.remarks.append(
-                f"warning: {entry.origin}: set {name} has {len(unknown)} {_NOUN[kind]}s that are not there, "
-                f"the first {unknown[0]}; they are left out"
-            )
-        return offset + rows[found]
+        return offset + numbering.members(entry.value, _NOUN[kind], name, entry.origin, self.remarks)
 
     def _numbering(self, key: str, kind: str) -> tuple[Numbering, int]:
         place = self.placed[key]
         return (place.nodes, place.node_offset) if kind == "node" else (place.cells, place.cell_offset)
 
-    def _refer(
-        self, key: str, kind: str, text: str, origin: str, within: tuple[tuple[str, str, str], ...] = ()
-    ) -> NDArray[np.int64]:
-        """Rows of what data name: a number, a set, or one of an instance, as in Part-1-1.Set-1."""
-        place, _ = self._locate(key, kind, text)
+    def _refer(self, key: str, kind: str, text: str, origin: str, within: tuple[_Key, ...] = ()) -> Ints:
+        """Rows of a number or a set in a line of data, perhaps one of an instance, as in Part-1-1.Set-1."""
+        place = self._locate(key, kind, text)
         if place is None:
             sets = sorted(members.name for members in self.placed[key].scope.sets[kind].values())
-            known = meshfile.listed(sets) or "none"
-            raise InputError(f"{origin}: there is no {_NOUN[kind]} set {text}; sets: {known}")
+            raise InputError(f"{origin}: there is no {_NOUN[kind]} set {text}; sets: {meshfile.listed(sets)}")
         key, name = place
         if isinstance(name, str):
             return self._members(key, kind, name, within)
@@ -258,14 +237,14 @@ class Model:
             raise InputError(f"{origin}: there is no {_NOUN[kind]} {text}; correct it")
         return offset + rows
 
-    def _locate(self, key: str, kind: str, text: str) -> tuple[tuple[str, str | int] | None, str]:
-        """Scope and set or number that a name stands for, and the name without instances."""
+    def _locate(self, key: str, kind: str, text: str) -> tuple[str, str | int] | None:
+        """Scope, and set or number, of a name; None if there is no such set."""
         if text.isascii() and text.isdecimal() and len(text) <= 20:
-            return (key, int(text)), text
+            return key, int(text)
         text = text.strip().strip('"')
         wanted = text.casefold()
         if wanted in self.placed[key].scope.sets[kind]:
-            return (key, wanted), text
+            return key, wanted
         if key == "":
             for dot in (at for at, letter in enumerate(text) if letter == "."):
                 instance, rest = text[:dot].strip().strip('"').casefold(), text[dot + 1 :]
@@ -275,27 +254,14 @@ class Model:
                     return self._locate("", kind, rest)
             owners = [other for other, place in self.placed.items() if wanted in place.scope.sets[kind]]
             if len(owners) == 1:
-                return (owners[0], wanted), text
-        return None, text
+                return owners[0], wanted
+        return None
 
-    def _nodes_of(self, cells: NDArray[np.int64], face: int | None = None) -> NDArray[np.int64]:
-        """Nodes of elements, or of one face of each; ascending."""
-        found = [np.empty(0, np.int64)]
-        for start, block in zip(self.cell_starts, self.mesh.cells, strict=False):
-            rows = cells[(cells >= start) & (cells < start + len(block.ids))] - start
-            if len(rows):
-                nodes = block.nodes[rows]
-                if face is not None and block.kind in meshfile.FACES:
-                    faces = meshfile.FACES[block.kind]
-                    nodes = nodes[:, [corner for corner in faces[min(face, len(faces) - 1)] if corner >= 0]]
-                found.append(np.unique(nodes))
-        nodes = np.unique(np.concatenate(found))
-        return nodes[nodes >= 0]
-
-    def _surface(self, key: str, kind: str, rows: list[tuple[str, list[str]]]) -> NDArray[np.int64]:
+    def _surface(self, key: str, kind: str, rows: list[tuple[str, list[str]]]) -> Ints:
         """Nodes of a surface: of nodes, of elements' faces, or of all exterior faces of elements."""
-        found, exterior = [np.empty(0, np.int64)], None
-        by_face: dict[int | None, list[NDArray[np.int64]]] = {}
+        found: list[Ints] = []
+        exterior = None
+        by_face: dict[int | None, list[Ints]] = {}
         for origin, fields in rows:
             if not fields[0]:
                 raise InputError(f"{origin}: a surface of the whole model is not read; name an element set")
@@ -311,50 +277,40 @@ class Model:
             if exterior is None:
                 exterior = meshfile.exterior_faces(self.mesh.cells)
             found.append(np.unique(exterior[0][np.isin(exterior[1], cells)]))
-        found += [self._nodes_of(np.unique(np.concatenate(cells)), face) for face, cells in by_face.items()]
-        nodes = np.unique(np.concatenate(found))
+        found += [self.mesh.nodes_of(meshfile.union(cells), face) for face, cells in by_face.items()]
+        nodes = meshfile.union(found)
         return nodes[nodes >= 0]
 
     # Sections and boundary conditions
 
-    def _section(self, names: dict[tuple[str, str, str], str], key: str, name: str, material: str, origin: str) -> None:
-        place, _ = self._locate(key, "cell", f'"{name}"')
+    def _section(self, names: dict[_Key, str], key: str, name: str, material: str, origin: str) -> None:
+        place = self._locate(key, "cell", f'"{name}"')
         if place is None or not isinstance(place[1], str):
             self._refer(key, "cell", f'"{name}"', origin)
-            raise InputError(f"{origin}: a section takes an element set, not {name!r}; correct it")
+            raise InputError(f"{origin}: a section needs an element set, not {name!r}; correct it")
         published = names[place[0], "cell", place[1]]
         self.mesh.structural.add(published)
         if not material:
             return
         if material.casefold() not in self.given.materials:
-            known = [found.name for found in self.given.materials.values()]
-            raise InputError(
-                f"{origin}: there is no material {material!r}; materials: {meshfile.listed(known) or 'none'}"
-            )
+            known = meshfile.listed(found.name for found in self.given.materials.values())
+            raise InputError(f"{origin}: there is no material {material!r}; materials: {known}")
         law = self.given.materials[material.casefold()]
-        unusable = law.unusable
-        if not unusable and law.elastic is None:
-            unusable = "has no *ELASTIC"
-        elif not unusable and law.elastic and not (law.elastic[0] > 0 and -1 < law.elastic[1] < 0.5):
-            unusable = f"has E = {law.elastic[0]:g} and nu = {law.elastic[1]:g}"
-        if unusable or law.elastic is None:
-            self.remarks.append(
-                f"warning: {law.origin}: material {law.name} {unusable}, so it is not taken; give {published} a "
-                "[material] in the deck"
-            )
+        reason = law.unusable or (meshfile.invalid_moduli(*law.elastic) if law.elastic else "has no *ELASTIC")
+        if reason or law.elastic is None:
+            self.remarks.append(meshfile.unused_material(law.origin, law.name, reason, published))
             return
-        taken = FileMaterial(law.name, *law.elastic, law.density, law.origin)
-        self.mesh.materials.append((published, taken))
+        self.mesh.materials.append((published, FileMaterial(law.name, *law.elastic, law.density, law.origin)))
 
-    def _constrain(self, names: dict[tuple[str, str, str], str]) -> None:
-        """The boundary conditions at the end of the last step: later steps take nodes over from earlier ones."""
-        constraints: list[tuple[int, Constraint, NDArray[np.int64]]] = []
+    def _constrain(self, names: dict[_Key, str]) -> None:
+        """The boundary conditions at the end of the last step: later steps replace earlier ones node by node."""
+        constraints: list[tuple[int, Constraint, Ints]] = []
         for step, keyword in self.given.boundaries:
             constraints += [(step, *found) for found in self._boundary(names, keyword)]
         claimed = np.zeros((len(self.mesh.points), 3), bool)
         last = max((step for step, _, _ in constraints), default=0)
         kept: list[Constraint] = []
-        taken_over = False
+        replaced = False
         for step in range(last, -1, -1):
             of_step = [(constraint, nodes) for at, constraint, nodes in constraints if at == step]
             for constraint, nodes in of_step:
@@ -362,32 +318,30 @@ class Model:
                 if free.all():
                     kept.append(constraint)
                     continue
-                taken_over = True
+                replaced = True
                 for i, direction in enumerate(constraint.directions):
                     if free[:, i].any():
                         rest = nodes[free[:, i]]
-                        name = self.mesh.own_set(rest, f"{constraint.node_set} before step {last}")
+                        name = self.mesh.set_of(rest, f"{constraint.node_set} before step {last}")
                         values = constraint.displacement[i]
                         if isinstance(values, np.ndarray):
                             values = values[free[:, i]]
                         kept.append(Constraint(name, (direction,), (values,), constraint.origin))
             for constraint, nodes in of_step:
                 claimed[nodes[:, None], constraint.directions] = True
-        if taken_over:
-            self.remarks.append(f"{self.mesh.path}: boundary conditions of several steps; those at the end count")
+        if replaced:
+            self.remarks.append(f"{self.mesh.path}: boundary conditions of several steps; those of the last step count")
         self.mesh.constraints = kept
 
-    def _boundary(
-        self, names: dict[tuple[str, str, str], str], keyword: Keyword
-    ) -> Iterator[tuple[Constraint, NDArray[np.int64]]]:
-        """Constraints of one keyword with their nodes: one of each set, and one of all nodes that are held alike."""
+    def _boundary(self, names: dict[_Key, str], keyword: Keyword) -> Iterator[tuple[Constraint, Ints]]:
+        """Constraints of one keyword with their nodes: one per set, and one for all single nodes with the same dofs."""
         of_sets: dict[tuple[str, str | int], list[tuple[int, float, str]]] = {}
-        of_nodes: dict[int, tuple[list[NDArray[np.int64]], list[float]]] = {}
+        of_nodes: dict[int, tuple[list[Ints], list[float]]] = {}
         for origin, fields in keyword.rows():
             directions, value = self._degrees(origin, fields, keyword)
             if not directions:
                 continue
-            place, _ = self._locate("", "node", fields[0])
+            place = self._locate("", "node", fields[0])
             if place is not None and isinstance(place[1], str):
                 of_sets.setdefault(place, []).extend((direction, value, origin) for direction in directions)
                 continue
@@ -402,18 +356,18 @@ class Model:
             for group in _without_clashes({(direction, value): origin for direction, value, origin in moved}):
                 axes, moves = zip(*group, strict=True)
                 yield Constraint(published, axes, moves, group[axes[0], moves[0]]), nodes_of_set
-        alike: dict[bytes, tuple[NDArray[np.int64], dict[int, Any]]] = {}
+        grouped: dict[bytes, tuple[Ints, dict[int, Any]]] = {}
         for direction, (nodes, values) in of_nodes.items():
-            for rows, at in _once(np.concatenate(nodes), np.array(values)):
+            for rows, at in _distinct(np.concatenate(nodes), np.array(values)):
                 uniform: Any = float(at[0]) if (at == at[0]).all() else at
-                alike.setdefault(rows.tobytes(), (rows, {}))[1].setdefault(direction, uniform)
-        for rows, by_direction in alike.values():
-            name = self.mesh.own_set(rows, f"{keyword.path.name}:{keyword.line}")
+                grouped.setdefault(rows.tobytes(), (rows, {}))[1].setdefault(direction, uniform)
+        for rows, by_direction in grouped.values():
+            name = self.mesh.set_of(rows, f"{keyword.path.name}:{keyword.line}")
             axes, moves = zip(*sorted(by_direction.items()), strict=True)
             yield Constraint(name, axes, moves, keyword.origin), rows
 
     def _degrees(self, origin: str, fields: list[str], keyword: Keyword) -> tuple[tuple[int, ...], float]:
-        """Directions (0, 1, 2) and displacement of a line of *BOUNDARY; rotations and temperatures are left out."""
+        """Directions (0, 1, 2) and displacement in a line of *BOUNDARY; rotations and temperatures are left out."""
         if len(fields) < 2 or not fields[1]:
             raise InputError(f"{origin}: {keyword.shown} needs a node or set, and degrees of freedom; correct it")
         word = "".join(fields[1].split()).upper()
@@ -421,33 +375,28 @@ class Model:
             return tuple(degree - 1 for degree in _SYMBOLIC[word]), 0.0
         if not word[:1].isdecimal():
             raise InputError(f"{origin}: {fields[1]!r} is no degree of freedom; there are {', '.join(_SYMBOLIC)}")
-        first = meshfile.integer(fields[1], origin)
-        last = meshfile.integer(fields[2], origin) if len(fields) > 2 and fields[2] else first
-        value = meshfile.real(fields[3], origin) if len(fields) > 3 and fields[3] else 0.0
+        first = integer(fields[1], origin)
+        last = integer(fields[2], origin) if len(fields) > 2 and fields[2] else first
+        value = real(fields[3], origin) if len(fields) > 3 and fields[3] else 0.0
         if last < first:
             raise InputError(f"{origin}: degrees of freedom {first} to {last} are none; correct them")
         return tuple(degree - 1 for degree in (1, 2, 3) if first <= degree <= last), value
 
 
-_NOUN = {"node": "node", "cell": "element"}
-
-
 def _without_clashes(moved: dict[tuple[int, float], str]) -> list[dict[tuple[int, float], str]]:
-    """(direction, displacement) -> origin, all in one unless a direction has two displacements."""
+    """(direction, displacement) -> origin, in one group unless a direction has two displacements."""
     if len({direction for direction, _ in moved}) == len(moved):
         return [dict(sorted(moved.items()))]
     return [{key: origin} for key, origin in moved.items()]
 
 
-def _once(
-    rows: NDArray[np.int64], values: NDArray[np.float64]
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Rows, ascending, with their values, each row once; rows with another value follow, for the caller to find out."""
+def _distinct(rows: Ints, values: Floats) -> Iterator[tuple[Ints, Floats]]:
+    """Rows, ascending and each once, with their values; rows with a second value follow as a separate pair."""
     order = np.lexsort((values, rows))
     rows, values = rows[order], values[order]
     while len(rows):
         first = np.append(True, np.diff(rows) != 0)
         yield rows[first], values[first]
-        # Of what is left, a repetition of the same value says nothing new.
+        # Repetitions of the same value are dropped.
         rest = ~first & np.append(False, np.diff(values) != 0)
         rows, values = rows[rest], values[rest]

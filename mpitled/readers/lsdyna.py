@@ -1,7 +1,7 @@
 """LS-DYNA decks (.k), in fixed columns (also long and I10) and with commas, as LS-PrePost and HyperMesh write them.
 
-Keywords that do not matter to an elastic solid with prescribed displacements are skipped and listed; those that
-change its mechanics and cannot be computed are kept as `MeshFile.refused`.
+Keywords without influence on an elastic solid with prescribed displacements are skipped and listed in a remark.
+Keywords that change the mechanics and cannot be computed are entered in `MeshFile.refused`.
 """
 
 from __future__ import annotations
@@ -11,19 +11,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mpitled.errors import InputError
-from mpitled.mesh import Constraint
-from mpitled.readers import meshfile
-from mpitled.readers.meshfile import Block, Cells, FileMaterial, MeshFile, Numbering, decoded, where
+from mpitled.mesh import Constraint, Ints
+from mpitled.readers import meshfile, text
+from mpitled.readers.meshfile import Cells, FileMaterial, MeshFile, NodeTable, Numbering
+from mpitled.readers.text import Block, KeywordLine, decode, where
 
 COMMENT = "$"
-WHAT = "an LS-DYNA deck (.k)"
-MOST_INCLUDES = 1000
+_KIND = "an LS-DYNA deck (.k)"
 
 #: Columns of a card of eight fields, of *NODE and of *ELEMENT_SOLID, by the format of the deck.
 _CARD = {"standard": [10] * 8, "i10": [10] * 8, "long": [20] * 8}
@@ -31,10 +30,10 @@ _NODE = {"standard": [8, 16, 16, 16, 8, 8], "i10": [10, 16, 16, 16, 10, 10], "lo
 _SOLID = {"standard": [8] * 10, "i10": [10] * 10, "long": [20] * 10}
 _FORMAT = {"+": "long", "-": "standard", "%": "i10"}
 
-#: Directions that the code TC of *NODE holds.
-_HELD = {1: (0,), 2: (1,), 3: (2,), 4: (0, 1), 5: (1, 2), 6: (0, 2), 7: (0, 1, 2)}
+#: Directions that the code TC of *NODE fixes.
+_FIXED = {1: (0,), 2: (1,), 3: (2,), 4: (0, 1), 5: (1, 2), 6: (0, 2), 7: (0, 1, 2)}
 
-#: Keywords that tie, load or move parts in ways that are not computed.
+#: Keywords that tie, load or move parts in ways that cannot be computed.
 _REFUSED = (
     "CONTACT", "CONSTRAINED", "RIGIDWALL", "AIRBAG", "ELEMENT_DISCRETE", "ELEMENT_MASS", "ELEMENT_SEATBELT",
     "ELEMENT_INERTIA", "DEFORMABLE_TO_RIGID", "BOUNDARY_CYCLIC", "BOUNDARY_SLIDING_PLANE", "BOUNDARY_NON_REFLECTING",
@@ -42,37 +41,29 @@ _REFUSED = (
 )  # fmt: skip
 _LOADS = ("LOAD_", "INITIAL_", "BOUNDARY_TEMPERATURE", "BOUNDARY_FLUX", "BOUNDARY_CONVECTION", "BOUNDARY_ACOUSTIC")
 _GENERATING = (
-    "INCLUDE_TRANSFORM",
-    "INCLUDE_STAMPED",
-    "INCLUDE_BINARY",
-    "NODE_TRANSFORM",
-    "ELEMENT_SOLID_",
-    "ELEMENT_GENERATE",
-)
-#: What may follow a material's name without changing the law.
+    "INCLUDE_TRANSFORM", "INCLUDE_STAMPED", "INCLUDE_BINARY", "NODE_TRANSFORM", "ELEMENT_SOLID_", "ELEMENT_GENERATE",
+)  # fmt: skip
 _ELASTIC = re.compile(r"MAT_(ELASTIC|0*1)(_TITLE)?")
 
 
 @dataclass(slots=True)
-class _Keyword:
-    name: str  # in capitals, without asterisk
-    path: Path
-    line: int
+class _Keyword(KeywordLine):
     format: str
     data: Block
-
-    @property
-    def origin(self) -> str:
-        return where(self.path, self.line)
-
-    def fail(self, what: str) -> NoReturn:
-        raise InputError(f"{self.origin}: *{self.name} {what}")
 
     def lines(self) -> list[tuple[int, str]]:
         return list(self.data.lines(COMMENT))
 
+    def split_title(self) -> tuple[str, list[tuple[int, str]]]:
+        """The title, if the keyword has one, and the lines below it; InputError without lines."""
+        lines = self.lines()
+        title = lines.pop(0)[1].strip() if "_TITLE" in self.name and lines else ""
+        if not lines:
+            self.fail("has no card; give it")
+        return title, lines
+
     def without(self, *options: str) -> tuple[str, set[str]]:
-        """The name without such options at its end, and those that were there."""
+        """The name without these options at its end, and the options that it had."""
         name, found = self.name, set()
         while (option := name.rpartition("_")[2]) in options:
             name = name.removesuffix(f"_{option}")
@@ -82,7 +73,7 @@ class _Keyword:
 
 @dataclass(slots=True)
 class _Card:
-    """Fields of one line, by commas or in columns."""
+    """Fields of one line, separated by commas or in columns."""
 
     fields: list[str]
     origin: str
@@ -100,11 +91,11 @@ class _Card:
 
     def integer(self, i: int) -> int:
         entry = self.text(i)
-        return meshfile.integer(entry, self.origin) if entry else 0
+        return text.integer(entry, self.origin) if entry else 0
 
     def real(self, i: int, default: float = 0.0) -> float:
         entry = self.text(i)
-        return meshfile.real(entry, self.origin) if entry else default
+        return text.real(entry, self.origin) if entry else default
 
     def integers(self) -> list[int]:
         return [self.integer(i) for i in range(len(self.fields))]
@@ -114,7 +105,7 @@ class _Card:
 class _Set:
     name: str
     origin: str
-    labels: list[NDArray[np.int64]] = field(default_factory=list)
+    labels: list[Ints] = field(default_factory=list)
     ranges: list[tuple[int, int, int]] = field(default_factory=list)
     parts: list[int] = field(default_factory=list)
     sets: list[int] = field(default_factory=list)
@@ -122,7 +113,7 @@ class _Set:
 
 
 def read(path: Path) -> MeshFile:
-    """The mesh of an LS-DYNA deck. InputError, with file and line, for all that is wrong with it."""
+    """The mesh of an LS-DYNA deck. InputError, with file and line, if the deck is wrong."""
     return _Reader(path).read()
 
 
@@ -140,20 +131,20 @@ def files(path: Path) -> list[Path]:
 def _keywords(
     path: Path, folders: tuple[Path, ...], within: tuple[Path, ...], opened: list[Path], layout: str
 ) -> Iterator[_Keyword]:
-    """Keywords of a file and of those that it includes, in the order of the text, up to *END."""
-    text = meshfile.read_text(path, WHAT)
+    """Keywords of a file and its includes, in the order of the text, up to *END."""
+    data = text.read_text(path, _KIND)
     opened.append(path)
     within = (*within, path.resolve())
-    begins = [*_keyword_lines(text), len(text)]
-    first = next((raw for raw in text[: begins[0]].split(b"\n") if raw.strip() and raw[:1] != b"$"), None)
+    begins = [*(match.start() for match in re.finditer(rb"(?m)^\*", data)), len(data)]
+    first = next((raw for raw in data[: begins[0]].split(b"\n") if raw.strip() and raw[:1] != b"$"), None)
     if first is not None and len(within) == 1:
         raise InputError(
-            f"{path}: is not an LS-DYNA deck; it begins {decoded(first).strip()[:40]!r}, not with a keyword"
+            f"{path}: is not an LS-DYNA deck; it begins {decode(first).strip()[:40]!r}, not with a keyword"
         )
-    line = 1 + text.count(b"\n", 0, begins[0])
+    line = 1 + data.count(b"\n", 0, begins[0])
     for begin, stop in pairwise(begins):
-        end = min(text.find(b"\n", begin) + 1 or len(text), stop)
-        words = decoded(text[begin + 1 : end]).split()
+        end = min(data.find(b"\n", begin) + 1 or len(data), stop)
+        words = decode(data[begin + 1 : end]).split()
         name = words[0].upper() if words else ""
         own = layout
         if name[-1:] in _FORMAT or (len(words) > 1 and words[1] in _FORMAT):
@@ -162,57 +153,31 @@ def _keywords(
         if name.startswith("KEYWORD"):
             options = "".join(words).upper()
             layout = "long" if "LONG=Y" in options else "i10" if "I10=Y" in options else layout
-        keyword = _Keyword(name, path, line, own, Block(path, line + 1, text, end, stop))
+        keyword = _Keyword(name, path, line, own, Block(path, line + 1, data, end, stop))
         if name == "END":
             return
         if name in ("INCLUDE_PATH", "INCLUDE_PATH_RELATIVE"):
             folders = (*folders, *(path.parent / folder for folder in _file_names(keyword)))
         elif name == "INCLUDE":
             for included in _file_names(keyword):
-                other = _included(keyword, included, folders, within, opened)
+                other = keyword.include(included, folders, within, len(opened))
                 yield from _keywords(other, folders, within, opened, layout)
         else:
             yield keyword
-        line += text.count(b"\n", begin, stop)
-
-
-def _keyword_lines(text: bytes) -> Iterator[int]:
-    at = 0 if text[:1] == b"*" else text.find(b"\n*") + 1
-    while at or text[:1] == b"*":
-        yield at
-        at = text.find(b"\n*", at) + 1
-        if not at:
-            return
+        line += data.count(b"\n", begin, stop)
 
 
 def _file_names(keyword: _Keyword) -> list[str]:
-    """File names, a line each; " +" at the end of a line continues the name."""
+    """File names, one per line; " +" at the end of a line continues the name."""
     names, start = [], ""
-    for _, text in keyword.lines():
-        text = start + text.strip()
-        start = text[:-1].strip() if text.endswith(" +") else ""
+    for _, words in keyword.lines():
+        name = start + words.strip()
+        start = name[:-1].strip() if name.endswith(" +") else ""
         if not start:
-            names.append(text)
+            names.append(name)
     if not names:
         keyword.fail("names no file")
     return names
-
-
-def _included(
-    keyword: _Keyword, name: str, folders: tuple[Path, ...], within: tuple[Path, ...], opened: list[Path]
-) -> Path:
-    if len(opened) > MOST_INCLUDES:
-        keyword.fail(f"is one of more than {MOST_INCLUDES} files; join some")
-    name = name.replace("\\", "/")
-    try:
-        for folder in (keyword.path.parent, *folders):
-            if (folder / name).is_file():
-                if (folder / name).resolve() in within:
-                    keyword.fail(f"names {name}, which includes this file; break the circle")
-                return folder / name
-    except (OSError, ValueError):
-        pass
-    keyword.fail(f"names {name}, which is not there; paths are relative to {keyword.path.name}")
 
 
 # --- keywords ------------------------------------------------------------------------------------------------------
@@ -222,18 +187,16 @@ class _Reader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.parameters: dict[str, str] = {}
-        self.points: list[NDArray[np.float64]] = []
-        self.ids: list[NDArray[np.int64]] = []
-        self.node_origins: list[tuple[int, str]] = []
-        self.held: list[tuple[NDArray[np.int64], int, str]] = []  # nodes, code TC, origin
-        self.solids: list[tuple[NDArray[np.int64], NDArray[np.int64], str]] = []  # rows (n, 10), parts (n,), origin
-        self.others: list[tuple[str, NDArray[np.int64], str]] = []  # keyword, rows, origin
+        self.nodes = NodeTable()
+        self.fixed: list[tuple[Ints, int, str]] = []  # nodes, code TC, origin
+        self.solids: list[tuple[Ints, Ints, str]] = []  # rows (n, 10), parts (n,), origin
+        self.others: list[tuple[str, Ints, str]] = []  # keyword, rows, origin
         self.sets: dict[str, dict[int, _Set]] = {"node": {}, "cell": {}, "part": {}}
         self.parts: dict[int, tuple[str, int]] = {}  # title and material
         self.materials: dict[int, FileMaterial] = {}
         self.unusable: dict[int, str] = {}
         self.curves: dict[int, tuple[list[float], str]] = {}
-        self.prescribed: list[tuple[_Keyword, _Card, bool]] = []  # whether it names a node instead of a set
+        self.prescribed: list[tuple[_Keyword, _Card, bool]] = []  # True if the card names a node, not a set
         self.skipped: dict[str, None] = {}
         self.remarks: list[str] = []
         self.refused: list[str] = []
@@ -242,33 +205,32 @@ class _Reader:
         any_keyword = False
         for keyword in _keywords(self.path, (self.path.parent,), (), [], "standard"):
             any_keyword = True
-            self._take(keyword)
+            self._handle(keyword)
         if not any_keyword:
             raise InputError(f"{self.path}: is not an LS-DYNA deck; no line is a keyword such as *NODE")
         if self.skipped:
-            self.remarks.append(
-                f"{self.path}: skipped, for nothing here depends on it: {meshfile.listed(self.skipped, 40)}"
-            )
+            skipped = meshfile.listed(self.skipped, 40)
+            self.remarks.append(f"{self.path}: skipped, because the results do not depend on it: {skipped}")
         return self._file()
 
-    def _take(self, keyword: _Keyword) -> None:
+    def _handle(self, keyword: _Keyword) -> None:
         name = keyword.name
         if name == "NODE":
-            self._nodes(keyword)
+            self._node(keyword)
         elif name == "ELEMENT_SOLID":
-            self._solids(keyword)
+            self._solid(keyword)
         elif name.startswith(("ELEMENT_SHELL", "ELEMENT_BEAM", "ELEMENT_TSHELL")):
-            self._others(keyword)
+            self._other(keyword)
         elif name.startswith(("SET_NODE", "SET_SOLID", "SET_PART")):
             self._set(keyword)
         elif name == "PART" or name.startswith("PART_"):
-            self._parts(keyword)
+            self._part(keyword)
         elif name.startswith("MAT_"):
             self._material(keyword)
         elif name.startswith("BOUNDARY_SPC_") and "SYMMETRY" not in name:
-            self._held_nodes(keyword)
+            self._prescribed(keyword, "BOUNDARY_SPC")
         elif name.startswith("BOUNDARY_PRESCRIBED_MOTION_"):
-            self._moved_nodes(keyword)
+            self._prescribed(keyword, "BOUNDARY_PRESCRIBED_MOTION")
         elif name in ("DEFINE_CURVE", "DEFINE_CURVE_TITLE"):
             self._curve(keyword)
         elif name in ("PARAMETER", "PARAMETER_LOCAL"):
@@ -278,21 +240,21 @@ class _Reader:
         elif name.startswith(_GENERATING):
             keyword.fail("is not read; let the preprocessor write out plain nodes and solids")
         elif name.startswith(_LOADS):
-            self.remarks.append(f"warning: {keyword.origin}: *{name} is not applied, as no load is")
+            self.remarks.append(text.load_warning(keyword))
         elif not name.startswith(("KEYWORD", "TITLE", "COMMENT", "END", "DATABASE_", "CONTROL_TERMINATION")):
             self.skipped[f"*{name}"] = None
 
     def _cards(self, keyword: _Keyword, widths: list[int] | None = None) -> Iterator[_Card]:
-        for line, text in keyword.lines():
-            yield self._card(keyword, line, text, widths)
+        for line, words in keyword.lines():
+            yield self._card(keyword, line, words, widths)
 
-    def _card(self, keyword: _Keyword, line: int, text: str, widths: list[int] | None = None) -> _Card:
+    def _card(self, keyword: _Keyword, line: int, words: str, widths: list[int] | None = None) -> _Card:
         origin = where(keyword.path, line)
-        if "," in text:
-            return _Card(text.removesuffix(",").split(","), origin, self.parameters)
-        text, fields, first = text.expandtabs(), [], 0
+        if "," in words:
+            return _Card(words.removesuffix(",").split(","), origin, self.parameters)
+        words, fields, first = words.expandtabs(), [], 0
         for width in widths or _CARD[keyword.format]:
-            fields.append(text[first : first + width])
+            fields.append(words[first : first + width])
             first += width
         while fields and not fields[-1].strip():
             fields.pop()
@@ -306,48 +268,43 @@ class _Reader:
             plain = re.sub(rb"(?m)^(\$.*|[ \t\r]*)\n", b"", chunk) if b"$" in chunk or b"\n\n" in chunk else chunk
             at_once = None
             if not pending and plain.strip() and not any(mark in plain for mark in (b",", b"&", b"\t")):
-                at_once = meshfile.columns(plain, widths, dtype)
+                at_once = text.columns(plain, widths, dtype)
             if at_once is not None:
                 found.append(at_once)
                 continue
             rows: list[list[float]] = []
-            for at, text in Block(keyword.path, line, chunk, 0, len(chunk)).lines(COMMENT):
-                pending.append(self._card(keyword, at, text, widths[len(pending)]))
+            for at, words in Block.of(keyword.path, line, chunk).lines(COMMENT):
+                pending.append(self._card(keyword, at, words, widths[len(pending)]))
                 if len(pending) == len(widths):
                     row: list[float] = []
                     for card, fields in zip(pending, widths, strict=True):
-                        take = card.integer if dtype is int else card.real
-                        row += [take(i) for i in range(len(fields))]
+                        convert = card.integer if dtype is int else card.real
+                        row += [convert(i) for i in range(len(fields))]
                     rows.append(row)
                     pending = []
             if rows:
-                try:
-                    found.append(np.array(rows, dtype))
-                except OverflowError:
-                    raise InputError(f"{where(keyword.path, line)}: a number below is too large; correct it") from None
+                found.append(text.as_array(rows, dtype, where(keyword.path, line)))
         if pending:
             raise InputError(f"{pending[0].origin}: the last row of *{keyword.name} is not complete")
         return np.concatenate(found)
 
-    def _nodes(self, keyword: _Keyword) -> None:
+    def _node(self, keyword: _Keyword) -> None:
         rows = self._rows(keyword, [_NODE[keyword.format]], float)
         ids = meshfile.as_ids(rows[:, 0], "node", keyword.origin)
-        self.node_origins.append((sum(map(len, self.ids)), keyword.origin))
-        self.ids.append(ids)
-        self.points.append(rows[:, 1:4].copy())
+        self.nodes.add(ids, rows[:, 1:4].copy(), keyword.origin)
         for code in np.unique(rows[:, 4]):
-            if code in _HELD:
-                self.held.append((ids[rows[:, 4] == code], int(code), keyword.origin))
+            if code in _FIXED:
+                self.fixed.append((ids[rows[:, 4] == code], int(code), keyword.origin))
             elif code:
-                keyword.fail(f"has code {code:g} in the column TC; there are 0 to 7")
+                keyword.fail(f"has code {code:g} in the column TC; give 0 to 7")
 
-    def _solids(self, keyword: _Keyword) -> None:
+    def _solid(self, keyword: _Keyword) -> None:
         first = next(keyword.data.lines(COMMENT), None)
         if first is None:
             return
         widths = _SOLID[keyword.format]
         card = self._card(keyword, *first, widths)
-        # In the newer format the element and its part have a line of their own.
+        # In the newer format the element and its part have a separate line.
         cards = [widths[:2], widths] if len(card.fields) <= 2 else [widths]
         rows = self._rows(keyword, cards, int).astype(np.int64, copy=False)
         meshfile.checked_ids(rows[:, 0], "element", keyword.origin)
@@ -359,33 +316,30 @@ class _Reader:
             )
         self.solids.append((np.concatenate([rows[:, :1], nodes[:, :8]], axis=1), rows[:, 1].copy(), keyword.origin))
 
-    def _others(self, keyword: _Keyword) -> None:
-        """Shells and beams: only which nodes they have. What options add to their cards has no integers."""
+    def _other(self, keyword: _Keyword) -> None:
+        """Shells and beams: only their nodes are read. Cards that options add have no integers."""
         width = _SOLID[keyword.format]
         rows = []
-        for line, text in keyword.lines():
+        for line, words in keyword.lines():
             try:
-                rows.append((self._card(keyword, line, text, width).integers() + [0] * 10)[:6])
+                rows.append((self._card(keyword, line, words, width).integers() + [0] * 10)[:6])
             except InputError:
                 continue
         if rows:
-            self.others.append((keyword.name, np.array(rows).clip(-1, meshfile.LARGEST_ID + 1), keyword.origin))
+            self.others.append((keyword.name, np.array(rows).clip(-1, meshfile.MAX_ID + 1), keyword.origin))
 
     def _set(self, keyword: _Keyword) -> None:
-        name, options = keyword.without("TITLE", "COLLECT")
+        name, _ = keyword.without("TITLE", "COLLECT")
         kind = {"NODE": "node", "SOLI": "cell", "PART": "part"}[name[4:8]]
         option = name.split("_", 2)[2].removeprefix("LIST_") if name.count("_") > 1 else "LIST"
-        lines = keyword.lines()
-        title = lines.pop(0)[1].strip() if "TITLE" in options and lines else ""
-        if not lines:
-            keyword.fail("has no number; give it")
+        title, lines = keyword.split_title()
         card = self._card(keyword, *lines[0])
         number = card.integer(0)
-        if not 0 < number <= meshfile.LARGEST_ID:
-            raise InputError(f"{card.origin}: {number} is no number of a set; correct it")
+        if not 0 < number <= meshfile.MAX_ID:
+            raise InputError(f"{card.origin}: {number} is not a valid number of a set; correct it")
         chosen = self.sets[kind].setdefault(number, _Set(title or str(number), keyword.origin))
-        for line, text in lines[1:]:
-            card = self._card(keyword, line, text)
+        for line, words in lines[1:]:
+            card = self._card(keyword, line, words)
             if option == "GENERAL":
                 self._general(keyword, card, chosen)
                 continue
@@ -405,7 +359,7 @@ class _Reader:
 
     def _not_read(self, keyword: _Keyword, chosen: _Set, option: str) -> None:
         self.remarks.append(
-            f"warning: {keyword.origin}: *{keyword.name} chooses by {option}, which is not read; set {chosen.name} "
+            f"warning: {keyword.origin}: *{keyword.name} selects by {option}, which is not read; set {chosen.name} "
             "may lack members"
         )
 
@@ -413,7 +367,7 @@ class _Reader:
     def _range(card: _Card, chosen: _Set, first: int, last: int, step: int) -> None:
         if first == last == 0:
             return
-        if not 0 < first <= last <= meshfile.LARGEST_ID or step < 1:
+        if not 0 < first <= last <= meshfile.MAX_ID or step < 1:
             raise InputError(f"{card.origin}: {first} to {last} by {step} is no range of numbers; correct it")
         chosen.ranges.append((first, last, step))
 
@@ -432,11 +386,11 @@ class _Reader:
         else:
             self._not_read(keyword, chosen, option)
 
-    def _parts(self, keyword: _Keyword) -> None:
-        """Two cards each, title and numbers. With options there are more, and only the first part is read."""
+    def _part(self, keyword: _Keyword) -> None:
+        """Title and numbers of each part. Options add further cards; then only the first part is read."""
         lines = keyword.lines()
         if len(lines) < 2:
-            # An empty title is a blank line, which is no line here.
+            # `lines` leaves out blank lines, and an empty title is one.
             lines = [(keyword.line + 1, ""), *lines]
         pairs = zip(lines[0::2], lines[1::2], strict=False) if keyword.name == "PART" else [(lines[0], lines[1])]
         for title, numbers in pairs:
@@ -444,54 +398,38 @@ class _Reader:
             self.parts[card.integer(0)] = title[1].strip(), card.integer(2)
 
     def _material(self, keyword: _Keyword) -> None:
-        lines = keyword.lines()
-        if keyword.name.endswith("_TITLE"):
-            lines = lines[1:]
-        if not lines:
-            keyword.fail("has no card")
+        title, lines = keyword.split_title()
         card = self._card(keyword, *lines[0])
         number = card.integer(0)
         if not _ELASTIC.fullmatch(keyword.name):
             self.unusable[number] = f"is *{keyword.name}"
             return
         density, modulus, ratio = (card.real(i) for i in (1, 2, 3))
-        if not (modulus > 0 and -1 < ratio < 0.5):
-            self.unusable[number] = f"has E = {modulus:g} and nu = {ratio:g}"
+        if reason := meshfile.invalid_moduli(modulus, ratio):
+            self.unusable[number] = reason
             return
-        name = keyword.lines()[0][1].strip() if keyword.name.endswith("_TITLE") else f"material {number}"
+        name = title if "_TITLE" in keyword.name else f"material {number}"
         self.materials[number] = FileMaterial(name, modulus, ratio, density or None, keyword.origin)
 
     # Constraints
 
-    def _held_nodes(self, keyword: _Keyword) -> None:
+    def _prescribed(self, keyword: _Keyword, stem: str) -> None:
         name, options = keyword.without("ID")
-        if name not in ("BOUNDARY_SPC_SET", "BOUNDARY_SPC_NODE"):
-            self.refused.append(f"{keyword.origin}: *{keyword.name} is not read; use *BOUNDARY_SPC_SET")
-            return
-        for card in self._identified(keyword, "ID" in options):
-            self.prescribed.append((keyword, card, name.endswith("NODE")))
-
-    def _moved_nodes(self, keyword: _Keyword) -> None:
-        name, options = keyword.without("ID")
-        if name not in ("BOUNDARY_PRESCRIBED_MOTION_SET", "BOUNDARY_PRESCRIBED_MOTION_NODE"):
-            self.refused.append(f"{keyword.origin}: *{keyword.name} is not read; use *BOUNDARY_PRESCRIBED_MOTION_SET")
+        if name not in (f"{stem}_SET", f"{stem}_NODE"):
+            self.refused.append(f"{keyword.origin}: *{keyword.name} is not read; use *{stem}_SET")
             return
         for card in self._identified(keyword, "ID" in options):
             self.prescribed.append((keyword, card, name.endswith("NODE")))
 
     def _identified(self, keyword: _Keyword, with_id: bool) -> Iterator[_Card]:
-        """The cards without those that only give a number and a heading."""
+        """The cards without those with a number and a heading only."""
         for i, card in enumerate(self._cards(keyword)):
             heading = len(card.fields) > 1 and not re.fullmatch(r"[\s\d+.&-]*", card.fields[1])
             if not (with_id and (i == 0 or heading or len(card.fields) < 2)):
                 yield card
 
     def _curve(self, keyword: _Keyword) -> None:
-        lines = keyword.lines()
-        if keyword.name.endswith("_TITLE"):
-            lines = lines[1:]
-        if not lines:
-            keyword.fail("has no card")
+        _, lines = keyword.split_title()
         head = self._card(keyword, *lines[0])
         scale, offset = head.real(3, 1.0) or 1.0, head.real(5)
         ordinates = [scale * (self._card(keyword, *line, [20, 20]).real(1) + offset) for line in lines[1:]]
@@ -503,39 +441,34 @@ class _Reader:
             for name, value in zip(card.fields[0::2], card.fields[1::2], strict=False):
                 match = re.fullmatch(r"\s*([RIC])\s*(\w+)\s*", name, re.IGNORECASE)
                 if not match:
-                    raise InputError(f"{card.origin}: {name.strip()!r} is no parameter; write R or I, and its name")
+                    raise InputError(f"{card.origin}: {name.strip()!r} is no parameter; write R or I, and the name")
                 if match[1].upper() == "R":
-                    meshfile.real(value, card.origin)
+                    text.real(value, card.origin)
                 elif match[1].upper() == "I":
-                    meshfile.integer(value, card.origin)
+                    text.integer(value, card.origin)
                 self.parameters[match[2].casefold()] = value.strip()
 
     # The model
 
     def _file(self) -> MeshFile:
-        ids = np.concatenate([np.empty(0, np.int64), *self.ids])
-        points = np.concatenate([np.empty((0, 3)), *self.points])
-        ids, points, remarks = meshfile.without_repeats(ids, points, self.node_origins)
-        self.remarks += [f"{self.path}: {remark}" for remark in remarks]
+        ids, points = self.nodes.merged(self.path, self.remarks)
         mesh = MeshFile(self.path, "LS-DYNA", points, ids, remarks=self.remarks, refused=self.refused)
         self.numbering = {"node": Numbering(ids)}
         part_of = self._elements(mesh)
-        self.numbering["cell"] = Numbering(
-            np.concatenate([np.empty(0, np.int64), *(block.ids for block in mesh.cells if block.kind != "other")])
-        )
+        self.numbering["cell"] = Numbering(meshfile.joined(b.ids for b in mesh.cells if b.kind != "other"))
         self.mesh, self.part_of = mesh, part_of
         self._name_sets()
-        for nodes, code, origin in self.held:
+        for nodes, code, origin in self.fixed:
             rows = np.unique(self.numbering["node"].rows(nodes)[0])
-            name = mesh.own_set(rows, f"nodes with TC {code}")
-            mesh.constraints.append(Constraint(name, _HELD[code], (0.0,) * len(_HELD[code]), origin))
+            name = mesh.set_of(rows, f"nodes with TC {code}")
+            mesh.constraints.append(Constraint(name, _FIXED[code], (0.0,) * len(_FIXED[code]), origin))
         for keyword, card, of_node in self.prescribed:
             self._constrain(keyword, card, of_node)
         return mesh
 
-    def _elements(self, mesh: MeshFile) -> NDArray[np.int64]:
-        """Enter the solids by kind, then all others; the part of each solid."""
-        parts = [np.empty(0, np.int64)]
+    def _elements(self, mesh: MeshFile) -> Ints:
+        """Enter the solids by kind, then all other elements; returns the part of each solid."""
+        parts: list[Ints] = []
         for rows, part, origin in self.solids:
             nodes, kinds = rows[:, 1:], _kinds(rows[:, 1:])
             for row, (kind, corners) in enumerate(_CORNERS.items()):
@@ -545,20 +478,16 @@ class _Reader:
                     some = slice(None) if chosen.all() else chosen
                     labels = nodes[some] if kind == "hexahedron" else nodes[some][:, corners]
                     numbers = rows[some, 0].copy()
-                    resolved = meshfile.resolved(labels, self.numbering["node"], numbers, origin)
+                    resolved = self.numbering["node"].resolve(labels, numbers, origin)
                     mesh.cells.append(Cells(kind, f"SOLID, {len(corners)} nodes", numbers, resolved, origin))
                     parts.append(part[some])
         self.solids.clear()
-        meshfile.check_unique_cells(mesh.cells, range(len(mesh.cells)))
-        part_of = np.concatenate(parts)
+        meshfile.check_unique_cells(mesh.cells)
+        part_of = meshfile.joined(parts)
         for name, rows, origin in self.others:
             nodes, found = self.numbering["node"].rows(rows[:, 2:])
+            own = mesh.n_cells + np.arange(len(rows))
             mesh.cells.append(Cells("other", name, rows[:, 0], np.where(found, nodes, -1), origin))
-            own = (
-                len(part_of)
-                + np.arange(len(rows))
-                + sum(len(block.ids) for block in mesh.cells[:-1] if block.kind == "other")
-            )
             if np.isin(rows[:, 1], list(self.parts)).any():
                 mesh.structural.add(meshfile.add_set(mesh.cell_sets, name.lower(), own))
         return part_of
@@ -576,66 +505,51 @@ class _Reader:
             if material in self.materials:
                 mesh.materials.append((name, self.materials[material]))
             elif material:
-                why = self.unusable.get(material, "is not in the deck")
-                self.remarks.append(
-                    f"warning: {self.path}: material {material} of part {number} {why}, so it is not taken; give "
-                    f"'{name}' a [material] in the deck"
-                )
+                reason = self.unusable.get(material, "is not in the deck")
+                named = f"{material} of part {number}"
+                self.remarks.append(meshfile.unused_material(str(self.path), named, reason, name))
         for number, chosen in self.sets["part"].items():
             members = [np.flatnonzero(self.part_of == part) for labels in chosen.labels for part in labels]
             if members:
-                meshfile.add_set(mesh.cell_sets, f"parts {number}", np.unique(np.concatenate(members)))
+                meshfile.add_set(mesh.cell_sets, f"parts {number}", meshfile.union(members))
 
-    def _members(self, kind: str, number: int, within: tuple[int, ...]) -> NDArray[np.int64]:
+    def _members(self, kind: str, number: int, within: tuple[int, ...]) -> Ints:
         chosen, numbering = self.sets[kind][number], self.numbering[kind]
         if number in within:
             raise InputError(f"{chosen.origin}: set {number} is a part of itself; break the circle")
         if chosen.everything:
             return np.arange(len(numbering.ids))
-        labels = np.concatenate([np.empty(0, np.int64), *chosen.labels])
-        rows, there = numbering.rows(labels)
-        if not there.all():
-            self.remarks.append(
-                f"warning: {chosen.origin}: set {chosen.name} has {np.count_nonzero(~there)} "
-                f"{'nodes' if kind == 'node' else 'solids'} that are not there, the first {labels[~there][0]}; "
-                "they are left out"
-            )
-        found = [rows[there], *(numbering.between(*limits) for limits in chosen.ranges)]
+        noun = "node" if kind == "node" else "solid"
+        labels = meshfile.joined(chosen.labels)
+        rows = numbering.members(labels, noun, chosen.name, chosen.origin, self.remarks)
+        found = [rows, *(numbering.between(*limits) for limits in chosen.ranges)]
         for part in chosen.parts:
             cells = np.flatnonzero(self.part_of == part)
-            found.append(self._nodes_of(cells) if kind == "node" else cells)
+            found.append(self.mesh.nodes_of(cells) if kind == "node" else cells)
         for other in chosen.sets:
             if other not in self.sets[kind]:
                 raise InputError(f"{chosen.origin}: there is no set {other}; correct it")
             found.append(self._members(kind, other, (*within, number)))
-        return np.unique(np.concatenate(found))
-
-    def _nodes_of(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-        found, first = [np.empty(0, np.int64)], 0
-        for block in self.mesh.cells:
-            rows = cells[(cells >= first) & (cells < first + len(block.ids))] - first
-            found.append(np.unique(block.nodes[rows]))
-            first += len(block.ids)
-        return np.unique(np.concatenate(found))
+        return meshfile.union(found)
 
     def _constrain(self, keyword: _Keyword, card: _Card, of_node: bool) -> None:
         target = card.integer(0)
         if of_node:
-            rows, found = self.numbering["node"].rows(np.array([np.clip(target, 0, meshfile.LARGEST_ID)]))
+            rows, found = self.numbering["node"].rows(np.array([np.clip(target, 0, meshfile.MAX_ID)]))
             if not found[0]:
                 raise InputError(f"{card.origin}: there is no node {target}; correct it")
-            name = self.mesh.own_set(rows, f"node {target}")
+            name = self.mesh.set_of(rows, f"node {target}")
         elif target in self.sets["node"]:
             name = self.sets["node"][target].name
         else:
             known = meshfile.listed(sorted(self.sets["node"]))
-            raise InputError(f"{card.origin}: there is no node set {target}; sets: {known or 'none'}")
+            raise InputError(f"{card.origin}: there is no node set {target}; sets: {known}")
         if keyword.name.startswith("BOUNDARY_SPC"):
             if card.integer(1):
                 raise InputError(f"{card.origin}: *{keyword.name} in a local system is not read; use the global one")
-            held = tuple(i for i in range(3) if card.integer(2 + i))
-            if held:
-                self.mesh.constraints.append(Constraint(name, held, (0.0,) * len(held), card.origin))
+            fixed = tuple(i for i in range(3) if card.integer(2 + i))
+            if fixed:
+                self.mesh.constraints.append(Constraint(name, fixed, (0.0,) * len(fixed), card.origin))
             return
         degree, kind, curve = card.integer(1), card.integer(2), card.integer(3)
         if degree not in (1, 2, 3) or kind != 2:
@@ -648,21 +562,23 @@ class _Reader:
             raise InputError(f"{card.origin}: there is no curve {curve} with points; define it in *DEFINE_CURVE")
         ordinates, origin = self.curves[curve]
         if abs(ordinates[-1]) < max(map(abs, ordinates)):
-            self.remarks.append(f"warning: {origin}: curve {curve} ends below its largest; its last value is taken")
+            self.remarks.append(
+                f"warning: {origin}: curve {curve} ends below its largest value; its last value is used"
+            )
         moved = ordinates[-1] * (card.real(4, 1.0) or 1.0)
         self.mesh.constraints.append(Constraint(name, (degree - 1,), (moved,), card.origin))
         self.remarks.append(f"{card.origin}: curve {curve} is replaced by the loading curve, up to its last value")
 
 
-def _labels(values: list[int], card: _Card) -> NDArray[np.int64]:
+def _labels(values: list[int], card: _Card) -> Ints:
     """Numbers of nodes, solids or parts; 0 is an empty field."""
     chosen = [value for value in values if value]
-    if any(not 0 < value <= meshfile.LARGEST_ID for value in chosen):
-        raise InputError(f"{card.origin}: a number is not between 1 and {meshfile.LARGEST_ID}; correct it")
+    if any(not 0 < value <= meshfile.MAX_ID for value in chosen):
+        raise InputError(f"{card.origin}: a number is not between 1 and {meshfile.MAX_ID}; correct it")
     return np.array(chosen, np.int64)
 
 
-#: Which of the eight nodes are the corners; the others repeat one of them.
+#: Rows of the corners among the eight nodes; the other nodes repeat one of them.
 _CORNERS = {
     "hexahedron": [0, 1, 2, 3, 4, 5, 6, 7],
     "tetrahedron": [0, 1, 2, 3],
@@ -671,8 +587,8 @@ _CORNERS = {
 }
 
 
-def _kinds(nodes: NDArray[np.int64]) -> NDArray[np.int8]:
-    """Kind (n,), a row of _CORNERS, of solids with eight nodes (n, 8), the last of which may be the same, or 0."""
+def _kinds(nodes: Ints) -> NDArray[np.int8]:
+    """Kind (n,), a row of _CORNERS, of solids with eight nodes (n, 8), of which the last may be equal or 0."""
     last = nodes[:, 4:]
     kinds = np.zeros(len(nodes), np.int8)
     kinds[(last == last[:, :1]).all(axis=1)] = 2

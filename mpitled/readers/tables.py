@@ -1,44 +1,49 @@
-"""Tables of others: integration points (CSV or HDF5), areas of the outer surface and displacements at places (CSV)."""
+"""Tables: integration points (CSV or HDF5), areas of the outer surface (CSV) and displacements at points (CSV)."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpitled import store
 from mpitled.errors import InputError
+from mpitled.mesh import Floats, Ints
 from mpitled.readers import meshfile
+from mpitled.readers.text import Block, decode, read_text, separated, where
 
 
-def read_grid(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], dict[str, NDArray[np.int64]]]:
-    """Places (n, 3), volumes (n,) and sets of integration points, in the file's units, from CSV or HDF5.
+def read_grid(path: Path) -> tuple[Floats, Floats, dict[str, Ints]]:
+    """Points (n, 3), volumes (n,) and sets of integration points, in the file's units, from CSV or HDF5.
 
-    CSV has a line for each point: x, y, z, volume and, if the points are in sets, their names with semicolons
-    between them. A line of column names may come first. InputError if a volume is not positive.
+    CSV has a line for each point: x, y, z, volume and, optionally, the names of the point's sets with semicolons
+    between them. The first line may give the names of the columns. InputError if a volume is not positive.
     """
     if path.suffix.lower() in (".h5", ".hdf5", ".hdf"):
         points, volumes = store.read_grid(path)
-        sets: dict[str, NDArray[np.int64]] = {}
+        sets: dict[str, Ints] = {}
         first = None
     else:
         points, volumes, sets, first = _read_csv(path)
     if not len(points):
         raise InputError(f"{path}: has no integration points; give lines of x, y, z, volume")
     bad = np.flatnonzero(
-        ~((volumes > 0) & (volumes < meshfile.FARTHEST**3) & (np.abs(points) < meshfile.FARTHEST).all(axis=1))
+        ~(
+            (volumes > 0)
+            & (volumes < meshfile.MAX_COORDINATE**3)
+            & (np.abs(points) < meshfile.MAX_COORDINATE).all(axis=1)
+        )
     )
     if len(bad):
-        where = f"line {first + bad[0]}" if first is not None else f"row {bad[0] + 1}"
+        position = f"line {first + bad[0]}" if first is not None else f"row {bad[0] + 1}"
         raise InputError(
-            f"{path}: {where}: an integration point needs finite x, y, z and a positive volume ({len(bad)} such)"
+            f"{path}: {position}: an integration point needs finite x, y, z and a positive volume ({len(bad)} such)"
         )
     return points, volumes, sets
 
 
-def read_areas(path: Path, metre: float, ids: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Areas (n_nodes, 3), m^2, of a table of node, x, y, z; 0 where it has no line."""
+def read_areas(path: Path, metre: float, ids: Ints) -> Floats:
+    """Areas (n_nodes, 3), m^2, of a table of node, x, y, z; 0 for nodes without a line."""
     rows, first = _read_table(path, ("node", "x", "y", "z"))
     numbering = meshfile.Numbering(ids)
     if (np.diff(numbering.ids) == 0).any():
@@ -52,27 +57,29 @@ def read_areas(path: Path, metre: float, ids: NDArray[np.int64]) -> NDArray[np.f
     return areas
 
 
-def read_field(path: Path) -> tuple[NDArray[np.float64], int]:
-    """Places and displacements (n, 6), x, y, z, ux, uy, uz in the file's unit, and the line of the first."""
+def read_field(path: Path) -> tuple[Floats, int]:
+    """Points and displacements (n, 6), x, y, z, ux, uy, uz in the file's unit, and the line of the first row."""
     rows, first = _read_table(path, ("x", "y", "z", "ux", "uy", "uz"))
-    bad = np.flatnonzero(~(np.abs(rows) < meshfile.FARTHEST).all(axis=1))
+    bad = np.flatnonzero(~(np.abs(rows) < meshfile.MAX_COORDINATE).all(axis=1))
     if len(bad):
-        raise InputError(f"{path}: line {first + bad[0]}: a number is beyond {meshfile.FARTHEST:g} ({len(bad)} such)")
+        raise InputError(
+            f"{path}: line {first + bad[0]}: a number is beyond {meshfile.MAX_COORDINATE:g} ({len(bad)} such)"
+        )
     return rows, first
 
 
-def _read_table(path: Path, names: tuple[str, ...]) -> tuple[NDArray[np.float64], int]:
-    """Numbers (n, len(names)) of a CSV file, which may begin with these names, and the line of the first."""
-    text = meshfile.read_text(path, f"a table of {', '.join(names)} (CSV)")
+def _read_table(path: Path, names: tuple[str, ...]) -> tuple[Floats, int]:
+    """Numbers (n, len(names)) of a CSV file, and the line of the first row; the first line may give the names."""
+    text = read_text(path, f"a table of {', '.join(names)} (CSV)")
     end = text.find(b"\n") + 1 or len(text)
-    header = [name.strip().casefold() for name in meshfile.decoded(text[:end]).split(",")]
+    header = [name.strip().casefold() for name in decode(text[:end]).split(",")]
     named = header == list(names)
-    block = meshfile.Block(path, 1 + named, text, end if named else 0, len(text))
+    block = Block(path, 1 + named, text, end if named else 0, len(text))
     return _rows_of(block, len(names), ", ".join(names)), 1 + named
 
 
-def _rows_of(block: meshfile.Block, width: int, names: str) -> NDArray[np.float64]:
-    values, counts = meshfile.separated(block, float, b"#")
+def _rows_of(block: Block, width: int, names: str) -> Floats:
+    values, counts = separated(block, float, "#")
     if (counts != width).any():
         row = int(np.argmax(counts != width))
         raise InputError(
@@ -82,40 +89,35 @@ def _rows_of(block: meshfile.Block, width: int, names: str) -> NDArray[np.float6
     return values.reshape(-1, width)
 
 
-def _read_csv(
-    path: Path,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], dict[str, NDArray[np.int64]], int]:
-    text = meshfile.read_text(path, "a table of integration points (CSV)")
+def _read_csv(path: Path) -> tuple[Floats, Floats, dict[str, Ints], int]:
+    text = read_text(path, "a table of integration points (CSV)")
     end = text.find(b"\n") + 1 or len(text)
-    header = [name.strip().strip('"').casefold() for name in meshfile.decoded(text[:end]).strip().split(",")]
+    header = [name.strip().strip('"').casefold() for name in decode(text[:end]).strip().split(",")]
     start, named = (end, True) if any(name[:1].isalpha() for name in header) else (0, False)
     if named and (header[:4] not in (["x", "y", "z", "volume"], ["x", "y", "z", "v"]) or len(header) > 5):
         raise InputError(f"{path}: line 1: the columns are {', '.join(header)[:60]}; give x, y, z, volume and sets")
-    block = meshfile.Block(path, 1 + named, text, start, len(text))
+    block = Block(path, 1 + named, text, start, len(text))
     names: list[str] = []
-    if (named and len(header) > 4) or (not named and len(header) > 4):
+    if len(header) > 4:
         block, names = _split_sets(block)
     rows = _rows_of(block, 4, "x, y, z, volume")
-    sets: dict[str, NDArray[np.int64]] = {}
+    sets: dict[str, Ints] = {}
     if names:
         groups, group = np.unique(np.array(names), return_inverse=True)
         for i, several in enumerate(groups.tolist()):
             members = np.flatnonzero(group == i)
             for name in filter(None, (part.strip() for part in several.split(";"))):
-                sets[name] = np.union1d(sets[name], members) if name in sets else members
+                meshfile.extend_set(sets, name, members)
     return rows[:, :3].copy(), rows[:, 3].copy(), sets, 1 + named
 
 
-def _split_sets(block: meshfile.Block) -> tuple[meshfile.Block, list[str]]:
-    """The numbers without the last column, and that column."""
+def _split_sets(block: Block) -> tuple[Block, list[str]]:
+    """The columns of numbers, and the last column: the names of sets."""
     numbers, names = [], []
     for line, text in block.lines("#"):
         fields = text.split(",", 4)
         if len(fields) < 4:
-            raise InputError(
-                f"{meshfile.where(block.path, line)}: has {len(fields)} fields; give x, y, z, volume, sets"
-            )
+            raise InputError(f"{where(block.path, line)}: has {len(fields)} fields; give x, y, z, volume, sets")
         numbers.append(",".join(fields[:4]))
         names.append(fields[4].strip().strip('"') if len(fields) > 4 else "")
-    rows = "\n".join(numbers).encode()
-    return meshfile.Block(block.path, block.line, rows, 0, len(rows)), names
+    return Block.of(block.path, block.line, "\n".join(numbers).encode()), names

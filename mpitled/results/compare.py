@@ -20,8 +20,8 @@ from mpitled.cells import hexahedra
 from mpitled.errors import InputError, damaged
 from mpitled.model import Model
 from mpitled.model.build import OUTER
-from mpitled.readers import meshfile
-from mpitled.readers.meshfile import FARTHEST
+from mpitled.readers import text
+from mpitled.readers.meshfile import MAX_COORDINATE
 from mpitled.results import field
 from mpitled.results.field import Field
 
@@ -260,7 +260,7 @@ def _row(path: Path, radii: NDArray[np.float64], n: int, ours: Field) -> int:
 
 
 def _of_csv(path: Path) -> Reference:
-    file = io.StringIO(meshfile.decoded(meshfile.read_text(path, "a table of places and displacements (CSV)")))
+    file = io.StringIO(text.decode(text.read_text(path, "a table of places and displacements (CSV)")))
     with damaged(path, "give x, y, z, ux, uy, uz in each line"):
         rows = csv.reader(file)
         names = [name.strip() for name in next(rows, [])]
@@ -320,8 +320,11 @@ def _checked(path: Path, reference: Reference) -> Reference:
         array = getattr(reference, name)
         if array is not None and (array.shape != shape or not np.isfinite(array).all()):
             raise InputError(f"{path}: {name} has shape {array.shape} for {n} places, or values that are not finite")
-    if not (np.abs(reference.places) < FARTHEST).all() or not (np.abs(reference.displacement) < FARTHEST).all():
-        raise InputError(f"{path}: has places or displacements beyond {FARTHEST:g} m; correct them")
+    if (
+        not (np.abs(reference.places) < MAX_COORDINATE).all()
+        or not (np.abs(reference.displacement) < MAX_COORDINATE).all()
+    ):
+        raise InputError(f"{path}: has places or displacements beyond {MAX_COORDINATE:g} m; correct them")
     if n == 0:
         raise InputError(f"{path}: has no places")
     tag = None if reference.tag is None else reference.tag.astype(np.int64)

@@ -14,7 +14,7 @@ from mpitled import store
 from mpitled.cells.support_domains import moving_least_squares
 from mpitled.errors import InputError, damaged
 from mpitled.mesh import CORNERS
-from mpitled.meshing.cloud import boundary_faces
+from mpitled.meshing.faces import boundary_faces
 from mpitled.model import Model
 
 #: Source of a value: the hexahedron around the point, a support domain, or the hexahedron nearest to a point outside.

@@ -22,7 +22,7 @@ from scipy import ndimage
 
 from mpitled import atomic, deck, resources
 from mpitled.errors import InputError, damaged
-from mpitled.meshing.labels import VENTRICLES, Cells, Image, parts_of, read_image
+from mpitled.meshing.label_image import VENTRICLES, Image, Mask, read_image, segment
 from mpitled.results.field import Field, open_field
 
 DISPLACEMENT, INVERSE, LABELS = "displacement.nii.gz", "inverse_displacement.nii.gz", "labels.nii.gz"
@@ -55,7 +55,7 @@ class _Ball:
         """Whether points (n, 3), m, are inside."""
         return np.asarray(((places - self.centre) ** 2).sum(axis=1) < self.radius**2)
 
-    def voxels(self, image: Image) -> Cells:
+    def voxels(self, image: Image) -> Mask:
         """The image's voxels (nz, ny, nx) whose centres are inside."""
         x, y, z = (
             (image.origin[i] + image.voxel[i] * (np.arange(n) + 0.5) - self.centre[i]) ** 2
@@ -112,7 +112,7 @@ def write_nifti(run: Path, directory: Path) -> Written:
     return Written(paths, label, missed, field.share, field.complete)
 
 
-def _carried(image: Image, body: Cells, ventricles: Sequence[Cells], before: NDArray[np.float64]) -> NDArray[np.int32]:
+def _carried(image: Image, body: Mask, ventricles: Sequence[Mask], before: NDArray[np.float64]) -> NDArray[np.int32]:
     """Labels (n,) of voxels with undeformed positions `before` (n, 3), in voxels by z, y, x.
 
     The label is that of the voxel around the position, except in ventricles: displacements below half a voxel would
@@ -135,7 +135,7 @@ def _carried(image: Image, body: Cells, ventricles: Sequence[Cells], before: NDA
     return labels
 
 
-def _image_of(field: Field, run: Path) -> tuple[Image, Cells, list[Cells]]:
+def _image_of(field: Field, run: Path) -> tuple[Image, Mask, list[Mask]]:
     """The label image of a run, its voxels (nz, ny, nx) of the body, and those of each ventricle.
 
     InputError if the image is missing or has changed.
@@ -156,7 +156,7 @@ def _image_of(field: Field, run: Path) -> tuple[Image, Cells, list[Cells]]:
         raise InputError(f"{path}: the label image of {run} is missing; restore it")
     image = read_image(path)
     try:
-        body, parts, _ = parts_of(image, labels)
+        body, parts, _ = segment(image, labels)
     except InputError as error:
         raise InputError(f"{error}; it has changed since {run} was computed") from None
     voxel = float(image.voxel.prod())
@@ -186,7 +186,7 @@ def _balls(field: Field) -> tuple[_Ball, _Ball] | tuple[None, None]:
     return seed, tumour
 
 
-def _reached(image: Image, body: Cells, index: NDArray[np.int64], displacement: NDArray[np.float64]) -> Cells:
+def _reached(image: Image, body: Mask, index: NDArray[np.int64], displacement: NDArray[np.float64]) -> Mask:
     """Voxels (nz, ny, nx) where the deformed body may be: at most the displacement of its surface away from it."""
     surface = body & ~ndimage.binary_erosion(body)
     far = np.linalg.norm(displacement[surface[tuple(index.T)]], axis=1).max()

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mpitled import atomic
 from mpitled.cells import hexahedra
-from mpitled.meshing.cloud import boundary_faces, interface_faces
+from mpitled.meshing.faces import boundary_faces, interface_faces
 from mpitled.model import Model
 from mpitled.results.figures import BY_KEY, RELAXATION, LowestJacobian, Report, rows
 from mpitled.results.final_state import FinalState, read

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay, cKDTree
 
 from mpitled import store
-from mpitled.meshing.cloud import FACES, boundary_faces, interface_faces
+from mpitled.meshing.faces import FACES, boundary_faces, interface_faces
 from mpitled.results.final_state import VENTRICLES, FinalState
 
 #: A tetrahedron of the cloud has an integration point within this many cube roots of that point's volume; a tetrahedron
