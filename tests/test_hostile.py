@@ -129,7 +129,8 @@ def test_a_bomb_of_integration_points_is_asked_for_its_room(tmp_path, monkeypatc
 def test_numbers_that_kernels_would_follow_out_of_their_arrays_are_refused(model):
     whole = model.read_bytes()
     for name, value in (
-        ("blocks/0/nodes", 10**9), ("blocks/1/nodes", -1), ("blocks/1/material", 7), ("field_domains", 10**6), ("prescribed_dofs", -3),
+        ("blocks/0/nodes", 10**9), ("blocks/1/nodes", -1), ("blocks/1/material", 7),
+        ("field_domains", 10**6), ("prescribed_dofs", -3),
         ("partitions/2/nodes", 10**7), ("partitions/2/cells", 10**7), ("partitions/2/rows", 10**7),
         ("partitions/2/shared", 10**7), ("partitions/2/neighbours", 5), ("partitions/2/shared_offsets", 10**6),
     ):  # fmt: skip
