@@ -1,7 +1,8 @@
-"""What an HDF5 file of a stranger may be, seen before any of it is read.
+"""Validation of untrusted HDF5 files, before any of their data are read.
 
-HDF5 follows links and storage into other files, and takes room for what a file claims to hold. So every link must be a
-hard one, every dataset lie in the file itself, and none claim more than its bytes can make.
+HDF5 follows links and storage into other files, and allocates the memory that a file claims to need. Every link must
+therefore be a hard link, every dataset must be stored in the file itself, and no dataset may claim more data than its
+stored bytes can hold.
 """
 
 from __future__ import annotations
@@ -11,25 +12,25 @@ from typing import Any
 
 from mpitled.errors import InputError
 
-#: Objects in a file; ours have some tens.
-MOST_OBJECTS = 10_000
-#: Deflate, the strongest of the filters, makes no more of a byte than this.
-_INFLATED = 1032
+#: Largest number of objects in a file; files of mpitled have some tens.
+MAX_OBJECTS = 10_000
+#: Largest compression ratio of deflate, the strongest of the filters.
+_MAX_RATIO = 1032
 _HARD = 0  # H5L_TYPE_HARD
 #: Filters of HDF5 and h5py themselves: deflate, shuffle, fletcher32, szip, nbit, scale-offset, LZF.
 _FILTERS = {1, 2, 3, 4, 5, 6, 32000}
 
 
 def check_file(file: Any, path: Path, *, numbers: bool = False) -> None:
-    """Look at every object of an open h5py.File; `numbers`: of fixed-length numbers and text alone. InputError."""
-    room, todo, seen = path.stat().st_size, [file["/"]], {file["/"]}
+    """InputError unless every object of an open h5py.File is valid; `numbers`: fixed-length numbers and text only."""
+    free_bytes, todo, seen = path.stat().st_size, [file["/"]], {file["/"]}
     n_objects = 0
     while todo:
         group = todo.pop()
         for name in group:
             n_objects += 1
-            if n_objects > MOST_OBJECTS:
-                raise InputError(f"{path}: has more than {MOST_OBJECTS} objects; it is not read")
+            if n_objects > MAX_OBJECTS:
+                raise InputError(f"{path}: has more than {MAX_OBJECTS} objects; it is not read")
             item = member(group, name, path)
             if item in seen:
                 continue
@@ -37,25 +38,25 @@ def check_file(file: Any, path: Path, *, numbers: bool = False) -> None:
             if hasattr(item, "keys"):
                 todo.append(item)
             elif hasattr(item, "shape"):
-                room -= check_dataset(item, path)
+                free_bytes -= check_dataset(item, path)
                 if numbers and item.dtype.kind not in "fiuSb":
                     raise InputError(
                         f"{path}: {item.name} holds other than numbers and text of fixed length; it is not read"
                     )
-    # Each may be as large as the file, but not all of them.
-    if room < 0:
+    # One dataset may be as large as the file, but not all of them.
+    if free_bytes < 0:
         raise InputError(f"{path}: claims to hold more than its {path.stat().st_size} bytes; write it anew")
 
 
 def member(group: Any, name: str, path: Path) -> Any:
-    """A group or dataset of a group, if it is there by a hard link. InputError."""
+    """A group or dataset of a group. InputError unless it is a hard link."""
     if group.id.links.get_info(name.encode()).type != _HARD:
         raise InputError(f"{path}: {name} is a link that leads elsewhere; it is not followed: copy the data in")
     return group[name]
 
 
 def check_dataset(dataset: Any, path: Path) -> int:
-    """See that a dataset lies in its file and claims no more than its bytes can make; these. InputError."""
+    """Stored bytes of a dataset. InputError if it is in another file, or claims more data than these bytes can hold."""
     if dataset.is_virtual or dataset.external:
         raise InputError(f"{path}: the data of {dataset.name} are in another file; it is not read: copy them in")
     properties, stored = dataset.id.get_create_plist(), dataset.id.get_storage_size()
@@ -70,7 +71,7 @@ def check_dataset(dataset: Any, path: Path) -> int:
     chunk = dataset.dtype.itemsize if dataset.chunks else 0
     for n in dataset.chunks or ():
         chunk *= n
-    most = stored * (_INFLATED if filters - {2, 3} else 1)
+    most = stored * (_MAX_RATIO if filters - {2, 3} else 1)
     if stored > path.stat().st_size or claimed > most or (filters and claimed and chunk > most):
         raise InputError(f"{path}: {dataset.name} claims {claimed} bytes, and {stored} are there; write the file anew")
     return int(stored)

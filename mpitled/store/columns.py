@@ -1,4 +1,4 @@
-"""Plain columns of numbers: tables of many runs, and grids of integration points."""
+"""Tables of columns: results of many runs, and grids of integration points."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mpitled.store.files import open_file, replacing
 
 
 def write_columns(path: Path, groups: Mapping[str, Mapping[str, Sequence[float | str]]]) -> None:
-    """Columns of tables, a group for each table, at once or not at all: numbers, or where there are others, text."""
+    """Write tables, a group for each, completely or not at all. A column is of numbers, or of text if it has any."""
     with replacing(path) as temporary, h5py.File(temporary, "w", locking=False) as file:
         for name, columns in groups.items():
             group = file.create_group(name, track_order=True)
@@ -27,7 +27,7 @@ def write_columns(path: Path, groups: Mapping[str, Mapping[str, Sequence[float |
 
 
 def table_contents(path: Path) -> dict[str, dict[str, Any]]:
-    """Columns and number of rows of each table, by name; empty if the HDF5 file is not of tables alone."""
+    """Columns and number of rows of each table, by name; empty if the HDF5 file holds anything but tables."""
     with open_file(path) as file, damaged(path, "make it anew"):
         hdf5_validation.check_file(file, path)
         tables = {}
@@ -43,7 +43,7 @@ def table_contents(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def read_grid(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places (n, 3) and volumes (n,) of a grid of integration points: datasets x, y, z, volume at the file's top."""
+    """Positions (n, 3) and volumes (n,) of integration points: datasets x, y, z, volume in the root group."""
     with open_file(path) as file, damaged(path, "write it anew"):
         names = ("x", "y", "z", "volume")
         if missing := [name for name in names if name not in file]:
@@ -54,7 +54,7 @@ def read_grid(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
             raise InputError(f"{path}: x, y, z and volume are not four lists of as many numbers; correct them")
         for item in given:
             hdf5_validation.check_dataset(item, path)
-        # Packed data may be a thousand times what is in the file.
+        # Compressed data may be a thousand times as large as the file.
         resources.check_memory(32 * len(given[0]), f"{path}: its {len(given[0])} points", "give fewer")
         columns = [item[...].astype(np.float64) for item in given]
     return np.stack(columns[:3], axis=1), columns[3]

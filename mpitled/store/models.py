@@ -189,13 +189,8 @@ def model_contents(path: Path) -> dict[str, Any]:
     """Sizes, sets, materials and figures of a model, as JSON can hold them."""
     with open_model(path) as file:
         blocks = [
-            {
-                "name": block.name,
-                "kind": block.kind.name,
-                "cells": block.n_cells,
-                "nodes": block.group["nodes"].shape[1],
-            }
-            for block in block_groups(file)
+            {"name": b.name, "kind": b.kind.name, "cells": b.n_cells, "nodes": b.group["nodes"].shape[1]}
+            for b in block_groups(file)
         ]
         return {
             "nodes": len(file["points"]),

@@ -71,7 +71,7 @@ def has_partition(path: Path, n_parts: int) -> bool:
 
 
 def partition_mark(path: Path, n_parts: int) -> str:
-    """An identifier of the partition in so many parts. InputError if there is none."""
+    """An identifier of the partition in so many parts. InputError if there is no such partition."""
     with open_model(path) as file:
         if n_parts == 1:
             return "whole"

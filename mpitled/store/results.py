@@ -81,18 +81,18 @@ class Result:
 
     def check(self) -> None:
         """Read all of the file. InputError names the data with a wrong checksum."""
-        broken = first_damaged(self._file)
+        found = first_damaged(self._file)
         for name, total in self._of_mesh.items():
             if checksum_of(self._grid[name]) != total:
-                broken = broken or name
+                found = found or name
         for name in (*(f"PointData/{n}" for n in self.names("Point")), *(f"CellData/{n}" for n in self.names("Cell"))):
             n_rows = int(self._grid[f"NumberOf{name.partition('Data')[0]}s"][0])
             totals = self._file[f"mpitled/checksums/{name}"]
             for frame in range(self.n_frames):
                 if checksum_of(self._grid[name], frame * n_rows, n_rows) != totals[frame]:
-                    broken = broken or f"{name} of frame {frame}"
-        if broken:
-            raise self._damaged(broken)
+                    found = found or f"{name} of frame {frame}"
+        if found:
+            raise self._damaged(found)
         _ = self._numbers
 
     def names(self, kind: str) -> list[str]:

@@ -47,9 +47,6 @@ _POINT_BYTES, _CELL_BYTES, _CORNER_BYTES = (24 + 16, 48), 8 + 1 + 8 + 2 + 1 + 4,
 #: Bytes of the tables of steps for each frame; of the deck and of HDF5 itself.
 _FRAME_BYTES, _FIXED_BYTES = 537, 47_800
 
-#: Rows first to last of a column.
-Rows = Callable[[int, int], NDArray[Any]]
-
 
 class _Section(NamedTuple):
     """Consecutive points or cells of the result, with the rows of this rank.
@@ -64,10 +61,19 @@ class _Section(NamedTuple):
     most: int  # on any rank
     row: int  # first of this rank
     corner: int  # first corner of this rank in the connectivity
+    data: int  # first row of this rank in the data of a frame
 
-    @property
-    def meshfree(self) -> bool:
-        return self.block is not None and self.block.kind.meshfree
+
+#: Datasets with a row for each cell, and their types.
+_CELL_COLUMNS: dict[str, Any] = {
+    "Types": np.uint8,
+    "CellData/cell_id": np.int64,
+    "CellData/material": np.int16,
+    "CellData/kind": np.uint8,
+    "CellData/part": np.int32,
+}
+#: Rows first to last of this rank in a section.
+Rows = Callable[[_Section, int, int], NDArray[Any]]
 
 
 def result_bytes(rows: PartRows, n_frames: int, cell_data: Mapping[str, int]) -> int:
@@ -232,19 +238,9 @@ class ResultWriter:
             raise ValueError(f"every frame holds {', '.join(sorted(self._announced))}")
         shares = {"series": checksum.share(series_of(time, series or {}), 0) if self._leads else 0}
         with writing(self._partial):
-            for name, values in point_data.items():
-                ends = np.cumsum([section.n_own for section in self._points])
-                pieces = [partial(_rows_of, piece) for piece in np.split(values, ends[:-1])]
-                shares[f"PointData/{name}"] = self._write_data(name, values, int(ends[-1]), self._points, pieces)
-            for name, of_cells in cell_data.items():
-                pieces = [
-                    partial(_constant, np.nan, shape=of_cells.shape[1:])
-                    if block is None
-                    else partial(_rows_of, of_cells[block.first_own : block.first_own + block.n_own])
-                    for block in (section.block for section in self._cells)
-                ]
-                n_own = self._part.n_own_cells
-                shares[f"CellData/{name}"] = self._write_data(name, of_cells, n_own, self._cells, pieces)
+            for kind, data in (("Point", point_data), ("Cell", cell_data)):
+                for name, values in data.items():
+                    shares[f"{kind}Data/{name}"] = self._write_data(kind, name, values)
             totals = self._totals(shares)
             if self._leads:
                 for name, value in (series or {}).items():
@@ -255,13 +251,18 @@ class ResultWriter:
             self._frame += 1
             self._announce(self._frame, time)
 
-    def _write_data(
-        self, name: str, values: NDArray[Any], length: int, sections: Sequence[_Section], rows: Sequence[Rows]
-    ) -> int:
-        """Write the data of the present frame; this rank's share of the checksum."""
+    def _write_data(self, kind: str, name: str, values: NDArray[np.floating]) -> int:
+        """Write "Point" or "Cell" data of the present frame; this rank's share of the checksum."""
+        sections, n = (self._points, self._n_points) if kind == "Point" else (self._cells, self._n_cells)
+        length = self._part.n_own_cells if kind == "Cell" else sum(section.n_own for section in sections)
         if len(values) != length:
             raise ValueError(f"{name}: {values.shape} values for {length} rows")
-        kind, n = ("Point", self._n_points) if sections is self._points else ("Cell", self._n_cells)
+
+        def rows(section: _Section, first: int, last: int) -> NDArray[np.floating]:
+            if kind == "Cell" and section.block is None:
+                return np.full((last - first, *values.shape[1:]), np.nan)
+            return values[section.data + first : section.data + last]
+
         return self._write_sections(self._file[f"VTKHDF/{kind}Data/{name}"], sections, rows, self._frame * n)
 
     def _announce(self, n_frames: int, time: float | None = None) -> None:
@@ -313,29 +314,27 @@ class ResultWriter:
 
     def _count(self) -> None:
         """The sections of points and cells, and the rows of this rank in each."""
-        part = self._part
-        self._efg = part.owned & (part.nodes >= part.n_fe_nodes)
-        cells: list[PartBlock | None] = in_file_order(part.blocks)
-        points = [None, *(block for block in part.blocks if block.kind.meshfree)]
-        n_own = [int(part.owned.sum()), *(block.n_own for block in points if block is not None)]
-        n_own += [int(self._efg.sum()) if block is None else block.n_own for block in cells]
-        counts = np.array([[*n_own, len(part.nodes)]])
-        table = counts if self._comm is None else np.concatenate(self._comm.allgather(counts))
-        totals, before = table[:, :-1].sum(axis=0), table[: part.part, :-1].sum(axis=0)
-        most = table.max(axis=0).tolist()
-        self._most_nodes = most[-1]
-        corners = [1 if block is None or block.kind.meshfree else block.n_nodes for block in (*points, *cells)]
-        sections = []
-        for own in (slice(0, len(points)), slice(len(points), len(totals))):
-            row = np.cumsum([0, *totals[own][:-1]]) + before[own]
-            corner = np.cumsum([0, *(corners[own] * totals[own])[:-1]]) + corners[own] * before[own]
-            columns = (corners[own], n_own[own], most[own], row.tolist(), corner.tolist())
-            sections.append(
-                [_Section(block, *numbers) for block, *numbers in zip((*points, *cells)[own], *columns, strict=True)]
-            )
-        self._points, self._cells = sections
-        self._n_points, self._n_cells = (int(totals[: len(points)].sum()), int(totals[len(points) :].sum()))
-        self._n_corners = int((np.array(corners) * totals)[len(points) :].sum())
+        part, meshfree = self._part, [block for block in self._part.blocks if block.kind.meshfree]
+        n_owned, n_efg = int(part.owned.sum()), int((part.owned & (part.nodes >= part.n_fe_nodes)).sum())
+        self._points, self._n_points, _ = self._sections([None, *meshfree], n_owned, True)
+        self._cells, self._n_cells, self._n_corners = self._sections(in_file_order(part.blocks), n_efg, False)
+
+    def _sections(
+        self, blocks: Sequence[PartBlock | None], n_others: int, of_points: bool
+    ) -> tuple[list[_Section], int, int]:
+        """Sections in order, with n_others rows in that without a block, and their rows and corners. Collective."""
+        n_own = np.array([[n_others if block is None else block.n_own for block in blocks]])
+        table = n_own if self._comm is None else np.concatenate(self._comm.allgather(n_own))
+        totals, before = table.sum(axis=0), table[: self._part.part].sum(axis=0)
+        corners = np.array([1 if block is None or block.kind.meshfree else block.n_nodes for block in blocks])
+        row = np.cumsum(totals) - totals + before
+        corner = np.cumsum(corners * totals) + corners * (before - totals)
+        # Data of points are in the order of the sections, data of cells in the order of the model.
+        of_cells = [0 if block is None else block.first_own for block in blocks]
+        data = np.cumsum(n_own[0]) - n_own[0] if of_points else of_cells
+        columns = np.stack([corners, n_own[0], table.max(axis=0), row, corner, data], axis=1).tolist()
+        sections = [_Section(block, *numbers) for block, numbers in zip(blocks, columns, strict=True)]
+        return sections, int(totals.sum()), int((corners * totals).sum())
 
     def _write_mesh(self) -> None:
         grid = self._file.create_group("VTKHDF")
@@ -344,72 +343,60 @@ class ResultWriter:
         self._table(grid, "NumberOfPoints", [self._n_points])
         self._table(grid, "NumberOfCells", [self._n_cells])
         self._table(grid, "NumberOfConnectivityIds", [self._n_corners])
-        self._write_connectivity(make(grid, "Connectivity", (self._n_corners,), np.int64))
-        self._write_offsets(make(grid, "Offsets", (self._n_cells + 1,), np.int64))
-        self._write_point_columns(grid)
-        self._write_cell_columns(grid)
+        part = self._part
+        self._owned = np.flatnonzero(part.owned)
+        self._result_rows = part.read("rows")  # of this rank's nodes
+        self._efg_rows = self._result_rows[part.owned & (part.nodes >= part.n_fe_nodes)]
+        corners = [section._replace(row=section.corner) for section in self._cells]
+        self._write_column(grid, "Connectivity", np.int64, (self._n_corners,), corners, self._connectivity)
+        self._write_column(grid, "Offsets", np.int64, (self._n_cells + 1,), self._offset_sections(), _offsets)
+        for name in ("Points", "PointData/node_id", "PointData/node_label"):
+            dtype, shape = (np.float64, (3,)) if name == "Points" else (np.int64, ())
+            rows = partial(self._point_rows, name.rpartition("/")[2])
+            self._write_column(grid, name, dtype, (self._n_points, *shape), self._points, rows)
+        for name, of_cells in _CELL_COLUMNS.items():
+            rows = partial(self._cell_rows, name.rpartition("/")[2])
+            self._write_column(grid, name, of_cells, (self._n_cells,), self._cells, rows)
+        del self._owned, self._result_rows, self._efg_rows
 
-    def _write_connectivity(self, made: h5py.Dataset) -> None:
-        rows, share = self._part.read("rows"), 0
-        points = iter(self._points[1:])
-        for section in self._cells:
-            if section.block is None:
-                of_section: Rows = partial(_rows_of, rows[self._efg])
-            elif section.meshfree:
-                of_section = partial(_count_from, next(points).row, 1)
-            else:
-                of_section = partial(self._corners, rows, section.block)
-            share += self._write_long(made, section.corner, section.n_own, section.most, of_section)
-        self._shares["Connectivity"] = share
+    def _write_column(
+        self, grid: h5py.Group, name: str, dtype: Any, shape: tuple[int, ...], sections: Sequence[_Section], rows: Rows
+    ) -> None:
+        made = _with_units(make(grid, name, shape, dtype))
+        self._shares[name] = self._write_sections(made, sections, rows)
 
-    def _corners(self, rows: NDArray[np.int64], block: PartBlock, first: int, last: int) -> NDArray[np.int64]:
-        """Points of cells of a block; rows: of this rank's nodes in the file."""
-        return rows[self._part.local(block.read("nodes", first, last))].ravel()
+    def _connectivity(self, section: _Section, first: int, last: int) -> NDArray[np.int64]:
+        """Points of cells."""
+        part, block = self._part, section.block
+        if block is None:
+            return self._efg_rows[first:last]
+        if block.kind.meshfree:
+            first_point = next(points.row for points in self._points if points.block is block)
+            return first_point + np.arange(first, last)
+        return self._result_rows[part.local(block.read("nodes", first, last))].ravel()
 
-    def _write_offsets(self, made: h5py.Dataset) -> None:
-        """The end of each cell's corners, after a first row with their start."""
-        share = self._write(made, 0, np.zeros(int(self._leads), np.int64))
-        for section in self._cells:
-            ends = partial(_count_from, section.corner + section.corners, section.corners)
-            share += self._write_long(made, section.row + 1, section.n_own, section.most, ends)
-        self._shares["Offsets"] = share
+    def _offset_sections(self) -> list[_Section]:
+        """A first row with the start of the corners, and rows with the end of each cell's corners."""
+        start = _Section(None, 0, int(self._leads), 1, 0, 0, 0)
+        return [start, *(section._replace(row=section.row + 1) for section in self._cells)]
 
-    def _write_point_columns(self, grid: h5py.Group) -> None:
-        part, owned = self._part, self._part.owned
-        columns: list[tuple[str, Any, tuple[int, ...], Rows, str]] = [
-            ("Points", np.float64, (3,), partial(part.read, "points"), "points"),
-            ("PointData/node_id", np.int64, (), partial(_rows_of, part.nodes), ""),
-            ("PointData/node_label", np.int64, (), partial(part.read, "node_ids"), ""),
-        ]
-        for name, dtype, shape, of_nodes, column in columns:
-            made = _with_units(make(grid, name, (self._n_points, *shape), dtype))
+    def _point_rows(self, name: str, section: _Section, first: int, last: int) -> NDArray[Any]:
+        if section.block is not None:
+            return section.block.read("points", first, last) if name == "Points" else np.full(last - first, -1)
+        own = self._owned[first:last]
+        if name == "node_id" or not len(own):
+            return self._part.nodes[own] if name != "Points" else np.empty((0, 3))
+        column = "points" if name == "Points" else "node_ids"
+        return self._part.read(column, int(own[0]), int(own[-1]) + 1)[own - own[0]]
 
-            def of_owned(first: int, last: int, of_nodes: Rows = of_nodes) -> NDArray[Any]:
-                return of_nodes(first, last)[owned[first:last]]
-
-            share = self._write_long(made, self._points[0].row, len(part.nodes), self._most_nodes, of_owned)
-            blocks = [section.block for section in self._points[1:] if section.block is not None]
-            of_blocks = [partial(block.read, column) if column else partial(_constant, -1) for block in blocks]
-            self._shares[name] = share + self._write_sections(made, self._points[1:], of_blocks)
-
-    def _write_cell_columns(self, grid: h5py.Group) -> None:
-        blocks = [section.block for section in self._cells]
-        columns: list[tuple[str, Any, list[Rows]]] = [
-            (
-                f"CellData/{name}",
-                dtype,
-                [partial(_constant, -1) if b is None else partial(b.read, column) for b in blocks],
-            )
-            for name, dtype, column in (("cell_id", np.int64, "cells"), ("material", np.int16, "material"))
-        ]
-        for name, dtype, values in (
-            ("Types", np.uint8, [_VTK_VERTEX if b is None else b.kind.vtk_type for b in blocks]),
-            ("CellData/kind", np.uint8, [EFG_NODE if b is None else b.kind.code for b in blocks]),
-            ("CellData/part", np.int32, [self._part.part] * len(blocks)),
-        ):
-            columns.append((name, dtype, [partial(_constant, value) for value in values]))
-        for name, dtype, rows in columns:
-            self._shares[name] = self._write_sections(make(grid, name, (self._n_cells,), dtype), self._cells, rows)
+    def _cell_rows(self, name: str, section: _Section, first: int, last: int) -> NDArray[Any]:
+        block = section.block
+        if block is not None and name in ("cell_id", "material"):
+            return block.read("cells" if name == "cell_id" else name, first, last)
+        constants = {"part": self._part.part, "Types": _VTK_VERTEX, "kind": EFG_NODE}
+        if block is not None:
+            constants |= {"Types": block.kind.vtk_type, "kind": block.kind.code}
+        return np.full(last - first, constants.get(name, -1))
 
     def _make_steps(self, point_data: Mapping[str, int], cell_data: Mapping[str, int], series: Sequence[str]) -> None:
         n = self._n_frames
@@ -451,32 +438,22 @@ class ResultWriter:
         if self._leads:
             dataset[...] = values
 
-    def _write(self, dataset: h5py.Dataset, row: int, values: NDArray[Any], first_row: int = 0) -> int:
-        return write_rows(dataset, row, values, first_row, self._transfer)
-
-    def _write_long(
-        self, dataset: h5py.Dataset, row: int, length: int, most: int, rows: Rows, first_row: int = 0
+    def _write_sections(
+        self, dataset: h5py.Dataset, sections: Sequence[_Section], rows: Rows, first_row: int = 0
     ) -> int:
-        """Write `rows` of a long column in pieces, from a row on; this rank's share of the checksum.
+        """Write the rows of each section in pieces; this rank's share of the checksum.
 
-        All ranks make as many calls as the rank with `most` rows. A copy of the whole column would be among the largest
+        All ranks make as many calls as the rank with most rows. A copy of a whole column would be among the largest
         arrays of a run.
         """
         share = 0
-        for begin in range(0, most, CHUNK_ROWS):
-            values = rows(min(begin, length), min(begin + CHUNK_ROWS, length))
-            share += self._write(dataset, row, values, first_row)
-            row += len(values)
+        for section in sections:
+            row = section.row
+            for begin in range(0, section.most, CHUNK_ROWS):
+                values = rows(section, min(begin, section.n_own), min(begin + CHUNK_ROWS, section.n_own))
+                share += write_rows(dataset, row, values, first_row, self._transfer)
+                row += len(values)
         return share
-
-    def _write_sections(
-        self, dataset: h5py.Dataset, sections: Sequence[_Section], rows: Sequence[Rows], first_row: int = 0
-    ) -> int:
-        """Write the rows of each section; this rank's share of the checksum."""
-        return sum(
-            self._write_long(dataset, section.row, section.n_own, section.most, of_section, first_row)
-            for section, of_section in zip(sections, rows, strict=True)
-        )
 
 
 def _with_units(dataset: h5py.Dataset) -> h5py.Dataset:
@@ -487,13 +464,5 @@ def _with_units(dataset: h5py.Dataset) -> h5py.Dataset:
     return dataset
 
 
-def _rows_of(values: NDArray[Any], first: int, last: int) -> NDArray[Any]:
-    return values[first:last]
-
-
-def _constant(value: float, first: int, last: int, shape: tuple[int, ...] = ()) -> NDArray[Any]:
-    return np.full((last - first, *shape), value)
-
-
-def _count_from(start: int, step: int, first: int, last: int) -> NDArray[np.int64]:
-    return start + step * np.arange(first, last)
+def _offsets(section: _Section, first: int, last: int) -> NDArray[np.int64]:
+    return section.corner + section.corners * np.arange(first + 1, last + 1)
