@@ -24,7 +24,7 @@ R, S, T = CORNERS.T
 MODES = np.stack([R * S, S * T, R * T, R * S * T], axis=1)
 
 
-def part(points, cells, domains, gradients, volumes, material, prescribed=((), ())):
+def part(points, cells, domains, gradients, volumes, material, prescribed=((), ()), materials=None):
     """A whole model as the only part, in the order of its own numbers."""
     n, n_domains = len(points), len(domains)
     columns = {
@@ -51,7 +51,7 @@ def part(points, cells, domains, gradients, volumes, material, prescribed=((), (
         nodes=np.arange(n),
         owned=np.ones(n, bool),
         first_row=0,
-        materials=(BRAIN, SOFT),
+        materials=materials or (BRAIN, SOFT),
         prescribed_dofs=np.asarray(prescribed[0], np.int64),
         prescribed_displacements=np.asarray(prescribed[1], float),
         prescribed_turns=np.zeros((len(prescribed[1]), 3)),
