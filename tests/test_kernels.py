@@ -367,6 +367,17 @@ def test_energy_is_kept_by_the_central_difference():
     assert coarse / fine > 3  # 4 for a second-order method
 
 
+def test_kinetic_energy_is_that_of_the_middle_of_two_half_steps_but_at_prescribed_dofs():
+    """There it is that of the last half step, because the forces do not move them."""
+    rng, n, dt = np.random.default_rng(6), 40, 1e-3
+    u, u_prev, f = rng.normal(size=(3, 3, n + kernels.PADDING))
+    m, counted, prescribed = rng.uniform(1, 2, n), rng.random(n) < 0.7, rng.random((3, n)) < 0.3
+    held = np.flatnonzero(prescribed.T.ravel()).astype(np.uint32)
+    velocity = (u - u_prev)[:, :n] / dt - np.where(prescribed, 0, 0.5 * dt * 1e6 * f[:, :n] / m)
+    found = kernels.kinetic_energy(u, u_prev, 1e6 * f, dt**2 / m, counted, held)
+    assert found == pytest.approx(0.5 * (counted * m * velocity**2).sum(), rel=1e-12)
+
+
 @pytest.mark.study
 def test_speed():
     """Million cells a second on one core, of each kernel, and the cost of a support domain in hexahedra."""
