@@ -22,7 +22,7 @@ BOUND, KERNELS, RELAXATION, RUN = (
     f"tests/test_{name}.py" for name in ("stability_bound", "kernels", "relaxation", "run")
 )
 REPORT, LABELS, RESUME, STORE = (f"tests/test_{name}.py" for name in ("report", "labels", "resume", "store"))
-SHARPNESS, ESTIMATE, IMAGES = (f"tests/test_{name}.py" for name in ("sharpness", "estimate", "images"))
+SHARPNESS, ESTIMATE, PHANTOMS = (f"tests/test_{name}.py" for name in ("sharpness", "estimate", "phantoms"))
 FORCES = f"{KERNELS}::test_forces_energies_and_jacobians_are_those_of_the_plain_formulas"
 WAVE = f"{RUN}::test_a_wave_keeps_its_energy_while_the_step_shortens"
 RANKS = f"{RUN}::test_one_two_and_four_ranks_agree_and_repeat"
@@ -62,11 +62,11 @@ MUTANTS: dict[str, list[tuple[str, str, str, str]]] = {
         ("tensors fall at once", "if 0 < trace < least else", "if trace < 0 else", RELAXATION),
         ("kinetic energy: prescribed dofs", "(v * v - w * w)", "(v * v - v * v)", KERNELS),
         ("reactions: work not trapezoidal", "0.5 * (r + reaction[p])", "r", WAVE),
-        ("reactions: no inertia", "if mobility is not None:\n            r +=", "if mobility is not None:\n            now +=", WAVE),
+        ("reactions: no inertia", "r += (amplitude * full[p]", "now += (amplitude * full[p]", WAVE),
         ("longer step: no change of gain", "(gain - 1) * mobility[n]", "0 * mobility[n]", WAVE),
         ("relaxation: work doubled", "work += half * (\n            counted", "work += (\n            counted", REPORT),
         ("mass added without energy", "energy += 0.5 * dm * v * v", "energy += 0 * dm * v", RUN),
-        ("arcs are chords", "(np.cos(amplitude * angle) - 1) * arm", "amplitude * (np.cos(angle) - 1) * arm", "tests"),
+        ("arcs are chords", "(np.cos(amplitude * angle) - 1) * arm", "amplitude * (np.cos(angle) - 1) * arm", PHANTOMS),
         ("iteration counts shared nodes twice", "if owned[n]:\n            old", "if True:\n            old", RANKS),
         ("estimate: residual squared", "np.sqrt(change), np.sqrt(residual)", "np.sqrt(change), residual", ESTIMATE),
     ],
@@ -85,8 +85,7 @@ MUTANTS: dict[str, list[tuple[str, str, str, str]]] = {
         ("J of the last step only", "s.f, *some)\n            s.smallest_jacobian = min(s.smallest_jacobian, J)",
          "s.f, *some)\n            s.smallest_jacobian = J", RUN),
         ("load a step late", "loading_curve((self.time + self.time_step)", "loading_curve((self.time)", RUN),
-        ("border cells after the halo", "*_compose_cells(sub, *(slice(n) for n in borders)),\n        (\"halo\", lambda s: halo.start(s.f)),",
-         "(\"halo\", lambda s: halo.start(s.f)),\n        *_compose_cells(sub, *(slice(n) for n in borders)),", HALO),
+        ("border cells twice", "*(slice(n, None) for n in borders)", "*(slice(0, None) for n in borders)", HALO),
     ],
     "mpitled/solver/stability_check.py": [
         ("a step of twice the length", "(s.time_step / (2 * safety))", "(s.time_step / (4 * safety))", KERNELS),
@@ -98,7 +97,7 @@ MUTANTS: dict[str, list[tuple[str, str, str, str]]] = {
     "mpitled/solver/spectral_radius.py": [
         ("held dofs take part", "mode[self._held] = 0\n        size", "size", SHARPNESS),
         ("the share may fall", "max(self.share, found)", "found", SHARPNESS),
-        ("a stiffer mode is not looked for", "or self.glances + 1 >= self.whole or not known", "or not known", SHARPNESS),
+        ("a stiffer mode is not looked for", "or self.glances + 1 >= self.whole", "", SHARPNESS),
     ],
     "mpitled/solver/dynamic_relaxation.py": [
         ("masses fall at once", "KEEP = 0.9", "KEEP = 0.0", RELAXATION),
@@ -118,7 +117,7 @@ MUTANTS: dict[str, list[tuple[str, str, str, str]]] = {
         ("sums on every rank", "if sub.rows.part == 0 else 0.0", "if sub.rows.part >= 0 else 0.0", RESUME),
     ],
     "mpitled/results/report.py": [
-        ("first ring without its hexahedra", "outside[model.hexahedra[on_seed[model.hexahedra].any(axis=1)]] = False", "pass", REPORT),
+        ("first ring without its hexahedra", "on_seed[model.hexahedra].any(axis=1)", "[]", REPORT),
         ("first ring without its domains", "outside[model.domains[ring_domains]] = False", "pass", REPORT),
         ("balance of an open interface", "and not np.any(outcome.field[_rim(faces)])", "", REPORT),
         ("rim is everywhere", "edges[~np.isin(forth, back)]", "edges", REPORT),
@@ -147,7 +146,7 @@ MUTANTS: dict[str, list[tuple[str, str, str, str]]] = {
     ],
     "mpitled/checksum.py": [
         ("even keys", "keys |= np.uint64(1)", "keys &= ~np.uint64(1)", RESUME),
-        ("places do not count", "keys = _STEPS[: len(some)] + np.uint64(begin)", "keys = 0 * _STEPS[: len(some)] + np.uint64(begin)", RESUME),
+        ("places do not count", "_STEPS[: len(some)] + np", "0 * _STEPS[: len(some)] + np", RESUME),
     ],
 }  # fmt: skip
 
