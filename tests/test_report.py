@@ -175,12 +175,19 @@ def test_volume_balance_of_an_incompressible_swelling(tmp_path):
         model = model_of(tmp_path, GROWTH, elements=elements, cloud="core")
         centre, radii = np.array([24e-3, 20e-3, 20e-3]), (2e-3, 3e-3)
         tumour = {"centre_m": list(centre), "seed_radius_m": radii[0], "radius_m": radii[1]}
-        made = report.compute(outcome_of(model, swell(centre, *radii), tumour))
+        outcome = outcome_of(model, swell(centre, *radii), tumour)
+        made = report.compute(outcome)
         balance, sphere = made["volume_balance"], 4 / 3 * np.pi * 1e9
         assert made["tumour_volume_mm3"] == pytest.approx(sphere * radii[1] ** 3, rel=1e-12)
         assert balance["tumour_added_mm3"] == pytest.approx(sphere * (radii[1] ** 3 - radii[0] ** 3), rel=1e-12)
         assert balance["elastic_compression_mm3"] == 0
         errors.append(balance["relative_error"])
+        # Of a surface that is not round, half of it at rest: the mean of the cubes.
+        field = outcome.field.copy()
+        field[outcome.seed[::2]] = 0
+        cubes = np.where(np.arange(len(outcome.seed)) % 2, radii[1] ** 3, radii[0] ** 3)
+        by_field = report.compute(replace(outcome, field=field))["tumour_volume_by_field_mm3"]
+        assert by_field == pytest.approx(sphere * cubes.mean(), rel=1e-12)
         # The first ring is about a spacing wide there, and the next node moves less than the surface's 1 mm.
         assert 0.2 < made["max_displacement_outside_first_ring_mm"] < 0.95
     assert errors[0] < 0.02
