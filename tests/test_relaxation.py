@@ -9,7 +9,7 @@ from test_kernels import HOURGLASS, box, cloud, no_domains, part
 from mpitled.deck import Solver
 from mpitled.parallel.halo import World
 from mpitled.parallel.subdomain import localise
-from mpitled.solver.dynamic_relaxation import BETWEEN, KEEP, SETTLED, Relaxation
+from mpitled.solver.dynamic_relaxation import BETWEEN, KEEP, SETTLED, STALLED, Relaxation
 
 TOLERANCE = 1e-5  # m
 
@@ -69,24 +69,42 @@ def test_masses_rise_at_once_and_fall_by_a_tenth_in_a_survey(rows, diagonal):
     assert mobility @ mass == pytest.approx(directions[:, :, None] * np.eye(3), abs=1e-9)
 
 
+def decide(method, distance, lowest):
+    """Whether the run ends at a survey whose estimates are these."""
+    figures = {"rayleigh_force": lowest, "rayleigh_mass": 1.0, "change": distance * lowest**0.5}
+    return method.decide(figures | {"residual": 0.5 * distance * lowest})[1]
+
+
 def test_an_estimate_that_grows_ends_nothing():
     """Though it is below the tolerance: a slower mode overtakes it. It ends as soon as the estimate shrinks."""
-    method, lowest = relaxation(bar()), 1e-4
+    method, lowest, distance = relaxation(bar()), 1e-4, 0.1 * TOLERANCE
     method.state.time = method.load_time
-
-    def ends(distance):
-        figures = {"rayleigh_force": lowest, "rayleigh_mass": 1.0, "change": distance * lowest**0.5}
-        return method.decide(figures | {"residual": 0.5 * distance * lowest})[1]
-
-    distance = 0.1 * TOLERANCE
     for _ in range(2 * SETTLED // BETWEEN):
         distance *= 1.01
-        assert not ends(distance)
-    assert ends(0.99 * distance)
+        assert not decide(method, distance, lowest)
+    assert decide(method, 0.99 * distance, lowest)
     assert method.distance == pytest.approx(0.99 * distance)
-    # With nothing gained by waiting, it has to hold for as many steps as are asked for.
+    # Damping is critical: u+ = u + retain (u - u_prev) - gain lowest u has a double root.
+    retain, gain = method.state.retain, method.state.gain
+    assert (1 + retain - gain * lowest) ** 2 == pytest.approx(4 * retain, abs=2 * lowest**2)
+    # It holds for as many steps as are asked for.
     method.settled, method.distance, calls = 0, 1.0, 1
-    while not ends(0.5 * TOLERANCE):
+    while not decide(method, 0.5 * TOLERANCE, lowest):
         calls += 1
     assert calls == SETTLED // BETWEEN
-    assert not ends(2 * TOLERANCE)
+    assert not decide(method, 2 * TOLERANCE, lowest)
+
+
+def test_it_stalls_only_after_the_load_and_while_neither_estimate_nor_slowest_mode_falls():
+    method, lowest, distance = relaxation(bar()), 1e-3, 1.0
+    method.begin()
+    assert not any(decide(method, distance, lowest) for _ in range(STALLED + 10))
+    method.state.time = method.load_time
+    for fall in (1.0, 0.95):
+        for _ in range(STALLED // 2 - 1):
+            lowest, distance = max(1e-4, fall * lowest), 1.001 * distance
+            assert not decide(method, distance, lowest)
+    calls = 1
+    while not decide(method, distance, lowest):
+        calls += 1
+    assert STALLED / 3 < calls < STALLED
