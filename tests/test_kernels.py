@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from mpitled import kernels
 from mpitled.cells import hexahedra
 from mpitled.material import Material, first_piola, strain_energy
 from mpitled.mesh import CORNERS, grid_points, structured_hexahedra
+from mpitled.model.loading import loading_curve
 from mpitled.parallel.subdomain import DOMAIN_NODE_COST, GATHERED_COST, cell_costs, localise
 from mpitled.solver.stability_check import Survey
 from mpitled.solver.step import State, at_rest, compose_forces, compose_march
@@ -178,7 +180,10 @@ def test_forces_energies_and_jacobians_are_those_of_the_plain_formulas(scene, st
     found = forces(sub, state).copy()
     # Sums of some 50 products of each cell, and of 8 to 20 cells a node: tens of roundings.
     assert np.abs(found - expected).max() < 1e-13 * np.abs(expected).max()
-    assert state.smallest_jacobian == pytest.approx(J.min(), rel=1e-14)
+    least = state.smallest_jacobian
+    assert least == pytest.approx(J.min(), rel=1e-14)
+    forces(sub, at_rest_again := replace(state, u=0 * state.u, seen=0 * state.u))
+    assert at_rest_again.smallest_jacobian == least  # of all steps
     seen = Survey(sub)
     figures = seen.look(state, 1.0)
     assert seen.jacobian[:-1] == pytest.approx(J, rel=2.0**-23)  # as it is kept
@@ -365,6 +370,35 @@ def test_energy_is_kept_by_the_central_difference():
     coarse, fine = swing(2e-4), swing(1e-4)
     assert coarse < 0.1
     assert coarse / fine > 3  # 4 for a second-order method
+
+
+def test_raised_masses_bring_their_kinetic_energy():
+    rng, n, dt = np.random.default_rng(7), 40, 1e-3
+    (u, u_prev), (m, required) = rng.normal(size=(2, 3, n)), rng.uniform(1, 2, (2, n))
+    counted, mobility = rng.random(n) < 0.7, dt**2 / m
+    added, energy = kernels.raise_mass(u, u_prev, mobility, required, counted, dt)
+    more = counted * np.maximum(0, required - m)
+    assert added == pytest.approx(more.sum(), rel=1e-12)
+    assert energy == pytest.approx(0.5 * (more * ((u - u_prev) / dt) ** 2).sum(), rel=1e-12)
+    assert mobility == pytest.approx(dt**2 / np.maximum(m, required), rel=1e-12)
+
+
+def test_steps_of_any_length_follow_a_constant_acceleration_and_the_load():
+    """u = a t^2 / 2 at free dofs, where the central difference is exact; prescribed dofs are where the load is then."""
+    points, cells, _ = box((1, 1, 1), 1.0)
+    rows = part(points, cells, *no_domains(), np.zeros(1), prescribed=(np.arange(3), [0.0, 0.1, 0.2]))
+    sub = localise(rows, HOURGLASS, 0.0, "mean")
+    state, (*_, (_, update)) = at_rest(sub, 4.0, 1.0), compose_march(sub)
+    for ratio in (1.0, 0.5, 1.4):
+        state.time_step *= ratio
+        state.mobility[:] = state.time_step**2  # of masses of 1 kg
+        state.f[:] = -2.0
+        kernels.change_step(state.u, state.u_prev, state.f, state.mobility, ratio)
+        update(state)
+        if state.step == 1:
+            state.u_prev[:, : sub.n_nodes], state.u[:, : sub.n_nodes] = 0, 1.0  # begins at rest a step before
+        assert state.u[:, 1 : sub.n_nodes] == pytest.approx(state.time**2, rel=1e-12)
+    assert state.u[:, 0] == pytest.approx(loading_curve(state.time / 4.0) * np.array([0.0, 0.1, 0.2]), rel=1e-12)
 
 
 def test_kinetic_energy_is_that_of_the_middle_of_two_half_steps_but_at_prescribed_dofs():
