@@ -9,6 +9,7 @@ text is there once. Exit status 1 if a mutant survives, or cannot be made.
 from __future__ import annotations
 
 import argparse
+import fcntl
 import os
 import shutil
 import subprocess
@@ -156,6 +157,9 @@ def fresh_copy() -> tuple[Path, dict[str, str]]:
     """A copy of what git knows, at the same place each time so that compiled kernels are found again."""
     base = Path(tempfile.gettempdir()) / f"mpitled-mutants-{os.getuid()}"
     tree = base / "tree"
+    base.mkdir(exist_ok=True)
+    lock = os.open(base / "lock", os.O_CREAT | os.O_RDWR)  # to the end of this process
+    fcntl.flock(lock, fcntl.LOCK_EX)
     shutil.rmtree(tree, ignore_errors=True)
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     for name in listed.splitlines():
