@@ -75,7 +75,7 @@ def box(shape=(37, 3, 2), edge=2e-3, distortion=0.0, seed=0):
     points = grid_points(shape, tuple(edge * n for n in shape))
     points += np.random.default_rng(seed).uniform(-distortion, distortion, points.shape) * edge
     cells = structured_hexahedra(shape)
-    material = (np.arange(len(cells)) // 37) % 2
+    material = (np.arange(len(cells)) // 60) % 2  # changes within a line of 37
     return points, cells, material
 
 
