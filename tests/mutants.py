@@ -133,7 +133,7 @@ MUTANTS: dict[str, list[tuple[str, str, str, str]]] = {
         ("void at the skull", 'free = parts["tissue"] & head.deep', 'free = parts["tissue"] & head.solid', LABELS),
         ("cavities stay", "    return ~outside[1:-1, 1:-1, 1:-1]", "    return cells", LABELS),
         ("sides swapped unnoticed", "if left > right:", "if left > 2 * right:", LABELS),
-        ("repairs with the emptiest cube", "empty_share.argmax(axis=1)", "empty_share.argmin(axis=1)", LABELS),
+        ("repairs with the emptiest cube", "-1.0, np.pad(share, 1)", "-1.0, 1 - np.pad(share, 1)", LABELS),
     ],
     "mpitled/store/partitions.py": [
         ("each rank owns all nodes", "(rows >= first_row) & (rows < end_row)", "rows >= 0", f"{STORE} {RANKS}"),
