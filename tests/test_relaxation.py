@@ -1,4 +1,4 @@
-"""Dynamic relaxation: masses that do not fall at once, and an end that a growing estimate puts off."""
+"""Dynamic relaxation: masses that do not fall at once, what ends it, and what stops any run."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ import pytest
 from test_kernels import HOURGLASS, box, cloud, no_domains, part
 
 from mpitled.deck import Solver
+from mpitled.errors import UnstableError
 from mpitled.parallel.halo import World
 from mpitled.parallel.subdomain import localise
 from mpitled.solver.dynamic_relaxation import BETWEEN, KEEP, SETTLED, STALLED, Relaxation
+from mpitled.solver.monitor import LEDGER_STARTS, Watch
 
 TOLERANCE = 1e-5  # m
 
@@ -108,3 +110,27 @@ def test_it_stalls_only_after_the_load_and_while_neither_estimate_nor_slowest_mo
     while not decide(method, distance, lowest):
         calls += 1
     assert STALLED / 3 < calls < STALLED
+
+
+def test_a_run_is_stopped_by_a_turned_cell_by_energies_that_do_not_add_up_and_by_numbers_that_are_none():
+    method = relaxation(bar())
+    method.state.time, method.state.step = 0.5 * method.load_time, LEDGER_STARTS
+    watch = Watch(World(), method.sub, 1e-6, "scene", "remedy")
+    well = dict.fromkeys(("hourglass", "stabilisation", "kinetic", "added", "dissipated"), 0.0)
+    well |= {"external": 1.0, "strain": 1.0, "min_jacobian": 1e-3, "step_ratio": 0.8}
+
+    def look(**changed):
+        method.look = lambda: well | changed
+        watch.look(method, 0)
+
+    look()
+    look(external=1.05)  # 5 % of the largest energy
+    for changed, reason in (
+        ({"min_jacobian": 0.0}, "a cell is turned inside out"),
+        ({"external": 1.06}, "energy balance is wrong by 5.7%"),
+        ({"strain": np.nan}, "diverged"),
+    ):
+        with pytest.raises(UnstableError, match=reason):
+            look(**changed)
+    method.state.step = LEDGER_STARTS - 1
+    look(external=2.0)
