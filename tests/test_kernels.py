@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from mpitled.cells.kind import HEXAHEDRA, SUPPORT_DOMAINS
 from mpitled.laws import Material, NeoHookean, first_piola, strain_energy
 from mpitled.mesh import CORNERS, grid_points, structured_hexahedra
 from mpitled.model import CellBlock
+from mpitled.model.loading import loading_curve
 from mpitled.parallel.subdomain import cell_costs, localise
 from mpitled.solver.stability_check import StabilityCheck
 from mpitled.store import PartBlock, PartRows
@@ -39,7 +41,7 @@ def column(rows, kind, name="nodes"):
     return np.concatenate([block.read(name) for block in rows.of_kind(kind.name)])
 
 
-def part(points, cells, domains, gradients, volumes, material, prescribed=((), ())):
+def part(points, cells, domains, gradients, volumes, material, prescribed=((), ()), materials=None):
     """A whole model as the only part, in the order of its own numbers."""
     n, n_domains = len(points), len(domains)
     columns = {
@@ -62,7 +64,7 @@ def part(points, cells, domains, gradients, volumes, material, prescribed=((), (
         nodes=np.arange(n),
         owned=np.ones(n, bool),
         first_row=0,
-        materials=(BRAIN, SOFT),
+        materials=materials or (BRAIN, SOFT),
         prescribed_dofs=np.asarray(prescribed[0], np.int64),
         prescribed_displacements=np.asarray(prescribed[1], float),
         rotation_paths=np.zeros((len(prescribed[1]), 3)),
@@ -84,7 +86,7 @@ def box(shape=(37, 3, 2), edge=2e-3, distortion=0.0, seed=0):
     points = grid_points(shape, tuple(edge * n for n in shape))
     points += np.random.default_rng(seed).uniform(-distortion, distortion, points.shape) * edge
     cells = structured_hexahedra(shape)
-    material = (np.arange(len(cells)) // 37) % 2
+    material = (np.arange(len(cells)) // 60) % 2  # changes within a line of 37
     return points, cells, material
 
 
@@ -192,7 +194,10 @@ def test_forces_energies_and_jacobians_are_those_of_the_plain_formulas(scene, st
     found = forces(sub, state).copy()
     # Sums of some 50 products of each cell, and of 8 to 20 cells a node: tens of roundings.
     assert np.abs(found - expected).max() < 1e-13 * np.abs(expected).max()
-    assert state.smallest_jacobian == pytest.approx(J.min(), rel=1e-14)
+    least = state.smallest_jacobian
+    assert least == pytest.approx(J.min(), rel=1e-14)
+    forces(sub, at_rest_again := replace(state, u=0 * state.u, u_cells=0 * state.u))
+    assert at_rest_again.smallest_jacobian == least  # of all steps
     seen = StabilityCheck(sub)
     figures = seen.evaluate(state, step_of(sub).terms, 1.0)
     assert seen.jacobian[:-1] == pytest.approx(J, rel=2.0**-23)  # as it is kept
@@ -380,6 +385,46 @@ def test_energy_is_kept_by_the_central_difference():
     coarse, fine = swing(2e-4), swing(1e-4)
     assert coarse < 0.1
     assert coarse / fine > 3  # 4 for a second-order method
+
+
+def test_raised_masses_bring_their_kinetic_energy():
+    rng, n, dt = np.random.default_rng(7), 40, 1e-3
+    (u, u_prev), (m, required) = rng.normal(size=(2, 3, n)), rng.uniform(1, 2, (2, n))
+    counted, mobility = rng.random(n) < 0.7, dt**2 / m
+    added, energy = kernels.raise_mass(u, u_prev, mobility, required, counted, dt)
+    more = counted * np.maximum(0, required - m)
+    assert added == pytest.approx(more.sum(), rel=1e-12)
+    assert energy == pytest.approx(0.5 * (more * ((u - u_prev) / dt) ** 2).sum(), rel=1e-12)
+    assert mobility == pytest.approx(dt**2 / np.maximum(m, required), rel=1e-12)
+
+
+def test_steps_of_any_length_follow_a_constant_acceleration_and_the_load():
+    """u = a t^2 / 2 at free dofs, where the central difference is exact; prescribed dofs are where the load is then."""
+    points, cells, _ = box((1, 1, 1), 1.0)
+    rows = part(points, cells, *no_domains(), np.zeros(1), prescribed=(np.arange(3), [0.0, 0.1, 0.2]))
+    sub = localise(rows, HOURGLASS, 0.0, "mean")
+    state, (*_, (_, update)) = at_rest(sub, 4.0, 1.0), compose_march(sub)
+    for ratio in (1.0, 0.5, 1.4):
+        state.time_step *= ratio
+        state.mobility[:] = state.time_step**2  # of masses of 1 kg
+        state.f[:] = -2.0
+        kernels.change_step(state.u, state.u_prev, state.f, state.mobility, ratio)
+        update(state)
+        if state.step == 1:
+            state.u_prev[:, : sub.n_nodes], state.u[:, : sub.n_nodes] = 0, 1.0  # begins at rest a step before
+        assert state.u[:, 1 : sub.n_nodes] == pytest.approx(state.time**2, rel=1e-12)
+    assert state.u[:, 0] == pytest.approx(loading_curve(state.time / 4.0) * np.array([0.0, 0.1, 0.2]), rel=1e-12)
+
+
+def test_kinetic_energy_is_that_of_the_middle_of_two_half_steps_but_at_prescribed_dofs():
+    """There it is that of the last half step, because the forces do not move them."""
+    rng, n, dt = np.random.default_rng(6), 40, 1e-3
+    u, u_prev, f = rng.normal(size=(3, 3, n + kernels.PADDING))
+    m, counted, prescribed = rng.uniform(1, 2, n), rng.random(n) < 0.7, rng.random((3, n)) < 0.3
+    held = np.flatnonzero(prescribed.T.ravel()).astype(np.uint32)
+    velocity = (u - u_prev)[:, :n] / dt - np.where(prescribed, 0, 0.5 * dt * 1e6 * f[:, :n] / m)
+    found = kernels.kinetic_energy(u, u_prev, 1e6 * f, dt**2 / m, counted, held)
+    assert found == pytest.approx(0.5 * (counted * m * velocity**2).sum(), rel=1e-12)
 
 
 @pytest.mark.study

@@ -16,6 +16,7 @@ from mpitled import deck
 from mpitled.errors import InputError
 from mpitled.meshing.faces import FACES, boundary_faces
 from mpitled.meshing.head import Grid, solid_cells
+from mpitled.meshing.label_image import read_image
 from mpitled.meshing.labels import mesh_labels
 
 nibabel = pytest.importorskip("nibabel")
@@ -309,6 +310,18 @@ def test_keys_that_do_not_fit_the_image_are_refused(tmp_path, keys, message):
 def tilt(degrees):
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize("share", [0.4, -0.4, 0.6, -0.6])
+def test_an_image_is_oblique_where_its_tilt_moves_a_voxel_by_more_than_half_its_size(tmp_path, share):
+    data, affine = phantom()
+    affine[1, 0] += share * np.abs(affine).max(axis=0)[:3].min() / data.shape[0]
+    path = save(tmp_path / "tilted.nii.gz", data, affine)
+    if abs(share) < 0.5:
+        read_image(path)
+    else:
+        with pytest.raises(InputError, match="oblique"):
+            read_image(path)
 
 
 @pytest.mark.parametrize(
