@@ -18,7 +18,7 @@ from mpitled import arguments
 from mpitled.errors import InputError, InterruptedRun, MpitledError
 
 if TYPE_CHECKING:
-    from mpitled.batch.cases import Case, Sweep, Told
+    from mpitled.batch.cases import Case, Sweep, SweepRecord
 
 # Modules are imported by the command that needs them: `--help` must not wait for compilers and libraries.
 
@@ -143,7 +143,7 @@ def _refuse_sweep(folder: Path) -> None:
 
 
 def _sweep(options: argparse.Namespace) -> int:
-    from mpitled.batch import cases, growth, summary, sweep, vary
+    from mpitled.batch import array_job, cases, growth, summary, sweep, vary
     from mpitled.errors import everywhere
     from mpitled.parallel.halo import World
 
@@ -162,7 +162,7 @@ def _sweep(options: argparse.Namespace) -> int:
         if plan.one_growth and (options.scheduler or options.only):
             raise InputError("--one-growth: is one run, and no array of jobs; leave out --scheduler and --only")
     if options.scheduler:
-        path = world.on_leader(lambda: sweep.array_job(plan, options.scheduler))
+        path = world.on_leader(lambda: array_job.write(plan, options.scheduler))
         if world.leads:
             print(json.dumps({"script": str(path)}) if options.json else path)
         return 0
@@ -170,7 +170,7 @@ def _sweep(options: argparse.Namespace) -> int:
     if options.only:
         return int(world.on_leader(lambda: _tell_case(plan, plan.cases[options.only - 1], options)))
     if plan.one_growth and world.leads:
-        growth.tell(plan)
+        growth.write_reports(plan)
     return _tabulate(plan, options, must=True) if world.leads else 0
 
 
@@ -184,12 +184,12 @@ def _tell_case(plan: Sweep, case: Case, options: argparse.Namespace) -> int:
         (record,) = summary.records(summary.collect(replace(plan, cases=(case,))))
         print(json.dumps(record, indent=2))
     if case.failure:
-        told = f"mpitled: case {case.number}, {case.words}: {case.failure}"
+        told = f"mpitled: case {case.number}, {case.label}: {case.failure}"
         print(f"{told} (--retry computes it again)", file=sys.stderr)
     return 3 if case.failure else 0
 
 
-def _tabulate(told: Told, options: argparse.Namespace, *, must: bool) -> int:
+def _tabulate(told: SweepRecord, options: argparse.Namespace, *, must: bool) -> int:
     """Print the table of a sweep, then write it; 3 if a case is broken. `must`: InputError if the disc refuses."""
     from mpitled.batch import summary
 
@@ -197,7 +197,7 @@ def _tabulate(told: Told, options: argparse.Namespace, *, must: bool) -> int:
     if options.json:
         print(json.dumps(summary.records(table), indent=2))
     elif not options.quiet:
-        print(summary.text(table))
+        summary.show(table)
     else:
         for text in summary.warnings(table):
             print(f"mpitled: {text}", file=sys.stderr)
@@ -298,7 +298,7 @@ def _report(options: argparse.Namespace) -> int:
     from mpitled.results import report
 
     if cases.is_sweep(options.directory):
-        return _tabulate(cases.told(options.directory), options, must=False)
+        return _tabulate(cases.read_record(options.directory), options, must=False)
     made = report.make(options.directory)
     _print(made, report.table, options)
     if options.html:
@@ -336,7 +336,8 @@ def _study(options: argparse.Namespace) -> None:
     if options.json:
         print(json.dumps(study.records(rows), indent=2))
     elif not options.quiet:
-        print(f"{study.table(rows)}\nwritten to {out}")
+        study.show(rows)
+        print(f"written to {out}")
 
 
 def _bench(options: argparse.Namespace) -> int:

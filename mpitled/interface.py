@@ -71,7 +71,7 @@ def open_result(path: str | Path) -> RunResult:
 
 def open_sweep(folder: str | Path) -> list[dict[str, Any]]:
     """A record for each case of a sweep, as pandas.DataFrame takes them. InputError if the folder holds no sweep."""
-    return records(collect(cases.told(Path(folder))))
+    return records(collect(cases.read_record(Path(folder))))
 
 
 class Frames:

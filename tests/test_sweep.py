@@ -1,4 +1,4 @@
-"""Sweeps: the same table however it was computed and whenever it was killed, broken cases told, array jobs."""
+"""Sweeps: the same table on processes and on groups of ranks, after a kill, with broken cases, and from array jobs."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -21,8 +22,7 @@ from conftest import ENVIRONMENT, ROOT, complaint, mpitled
 from scenes import TUMOUR, block, pulled
 
 from mpitled import lock, open_sweep
-from mpitled.batch import cases, launch, screen, summary, vary
-from mpitled.batch import sweep as array
+from mpitled.batch import array_job, cases, launch, summary, terminal, vary
 from mpitled.errors import InputError
 from mpitled.store import checkpoint_contents
 
@@ -39,6 +39,18 @@ def groups(tmp_path_factory):
     """The folder of the sweep that two groups of one rank computed, and what they said."""
     out = tmp_path_factory.mktemp("sweep") / "out"
     return out, mpitled(*WORDS, "--out", out, n=2, status=3).stderr
+
+
+def wait_until(condition: Callable[[], object], seconds: float = 60) -> None:
+    deadline = time.time() + seconds
+    while not condition() and time.time() < deadline:
+        time.sleep(0.02)
+
+
+def start(*words: object) -> subprocess.Popen[str]:
+    """The command in a process of its own."""
+    command = [str(Path(sys.executable).with_name("mpitled")), *map(str, words)]
+    return subprocess.Popen(command, env=ENVIRONMENT, cwd=ROOT, stderr=subprocess.DEVNULL, text=True)
 
 
 def at_work(folder: Path) -> list[int]:
@@ -68,18 +80,13 @@ def test_a_sweep_killed_at_work_gives_the_table_that_groups_of_ranks_give(tmp_pa
     assert sum("of 3 done] solver.load_steps=1: broken: unstable" in line for line in ended) == 1
 
     out = tmp_path / "killed"
-    command = [str(Path(sys.executable).with_name("mpitled")), *map(str, WORDS), "--out", str(out)]
-    with subprocess.Popen(command, env=ENVIRONMENT, cwd=ROOT, stderr=subprocess.DEVNULL) as process:
-        deadline = time.time() + 60
-        while not list(out.glob("*/done.json")) and time.time() < deadline:
-            time.sleep(0.02)
+    with start(*WORDS, "--out", out) as process:
+        wait_until(lambda: list(out.glob("*/done.json")))
         process.send_signal(signal.SIGKILL)
     ended = {path: path.stat().st_mtime_ns for path in out.glob("*/done.json")}
     assert 0 < len(ended) < 3
-    deadline = time.time() + 10
-    while at_work(out) and time.time() < deadline:
-        time.sleep(0.02)
-    assert at_work(out) == []  # what it had started ended with it
+    wait_until(lambda: not at_work(out), 10)
+    assert at_work(out) == []  # the processes of the cases ended with it
     mpitled("sweep", out, status=3)
     assert (out / "table.csv").read_bytes() == (by_groups / "table.csv").read_bytes()
     assert all(path.stat().st_mtime_ns == then for path, then in ended.items())
@@ -115,7 +122,7 @@ def test_tables_for_programs_and_for_people(tmp_path, groups):
     assert (again.stdout, again.stderr) == ("", "1 broken; --retry computes them again\n")
 
 
-def test_a_table_says_which_cases_were_warned_of(tmp_path, groups):
+def test_a_table_shows_which_cases_have_warnings(tmp_path, groups, capsys):
     out = shutil.copytree(groups[0], tmp_path / "out")
     sweep = cases.read(out)
     path = sweep.cases[1].folder / "report.json"
@@ -123,29 +130,28 @@ def test_a_table_says_which_cases_were_warned_of(tmp_path, groups):
     path.write_text(json.dumps(made | {"warnings": ["far from rest", "coarse"], "cloud_misfit_mm": 0.75}))
     table = summary.collect(sweep)
     summary.write(sweep, table)
-    words = "warning for solver.load_steps=500: far from rest; coarse"
-    printed = summary.text(table).splitlines()
-    assert [line.split()[1] == "*" for line in printed[-4:-1]] == [False, True, False]
+    line = "warning for solver.load_steps=500: far from rest; coarse"
+    summary.show(table)
+    printed = capsys.readouterr().out.splitlines()
+    assert [row.split()[1] == "*" for row in printed[-4:-1]] == [False, True, False]
     assert "0.750" in printed[-3]
-    assert printed[-1] == words
-    assert (out / "table.md").read_text().endswith(f"\n\n- {words}\n")
-    assert words in (out / "table.html").read_text()
+    assert printed[-1] == line
+    assert (out / "table.md").read_text().endswith(f"\n\n- {line}\n")
     with (out / "table.csv").open() as file:
         assert [row["warnings"] for row in csv.DictReader(file)] == ["", "far from rest; coarse", ""]
     with h5py.File(out / "table.h5") as file:
         assert file["table/warnings"].asstr()[1] == "far from rest; coarse"
     page = (out / "table.html").read_text()
+    assert line in page
     assert re.search(r'<th scope="col" class="number">solver.<wbr>load_steps</th><th scope="col">warned</th>', page)
-    assert '<th scope="col" class="number">largest displacement, mm</th>' in page  # though a case has none
+    assert '<th scope="col" class="number">largest displacement, mm</th>' in page  # also where a case has none
     assert re.search(r'<td colspan="\d+">unstable', page)
 
-    # Of two keys, two of whose cases were warned of the same.
     nu = "material.brain.poissons_ratio"
     rows = [row | {nu: 0.45 + 0.01 * i, "warnings": "coarse"} for i, row in enumerate(table.rows[:2])]
-    table = table._replace(keys=[*table.keys, nu], rows=[*rows, *table.rows[2:]])
-    assert summary.text(table._replace(rows=rows, times=table.times[:2])).splitlines()[-1] == (
+    assert summary.warnings(table._replace(keys=[*table.keys, nu], rows=rows)) == [
         f"warning for solver.load_steps=400 {nu}=0.45, solver.load_steps=500 {nu}=0.46: coarse"
-    )
+    ]
 
 
 def test_charts_show_what_differs_by_names_that_fit(tmp_path, groups, monkeypatch):
@@ -175,7 +181,9 @@ def test_charts_show_what_differs_by_names_that_fit(tmp_path, groups, monkeypatc
     assert drawn(table._replace(keys=[*table.keys, nu], rows=rows))[2][0] == "load_steps=400 poissons_ratio=0.45"
 
 
-def array_job(folder: Path, deck: Path, base: list[str], text: str, scheduler: str) -> tuple[Path, dict[str, str]]:
+def write_array_job(
+    folder: Path, deck: Path, base: list[str], text: str, scheduler: str
+) -> tuple[Path, dict[str, str]]:
     """The script for a sweep into folder/out, and variables with launchers that start what they are given.
 
     The folder stands for a set-up clone: the scripts set up what is missing in the one that they are made in.
@@ -189,7 +197,7 @@ def array_job(folder: Path, deck: Path, base: list[str], text: str, scheduler: s
         (tools / name).chmod(0o755)
     path = os.pathsep.join([str(tools), str(Path(sys.executable).parent), ENVIRONMENT["PATH"]])
     plan = cases.plan(deck, vary.grid([text]), base, 1, folder / "out")
-    return array.array_job(plan, scheduler), ENVIRONMENT | {"PATH": path}
+    return array_job.write(plan, scheduler), ENVIRONMENT | {"PATH": path}
 
 
 def test_an_array_job_computes_each_task_alone(tmp_path, monkeypatch):
@@ -197,7 +205,7 @@ def test_an_array_job_computes_each_task_alone(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     base = ["block.elements=[2,2,2]", "solver.method=dynamic-relaxation"]
     for scheduler, number in (("slurm", "SLURM_ARRAY_TASK_ID"), ("pbs", "PBS_ARRAY_INDEX")):
-        script, variables = array_job(tmp_path, CUBE, base, "solver.load_steps=400,500,600", scheduler)
+        script, variables = write_array_job(tmp_path, CUBE, base, "solver.load_steps=400,500,600", scheduler)
         assert "1-3\n" in script.read_text()
         assert "# 3 cases, each on 1 rank;" in script.read_text()
         assert ("srun --mpi=pmix" in script.read_text()) == (scheduler == "slurm")
@@ -234,7 +242,7 @@ def test_an_array_job_fits_its_sweep(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     plan = cases.plan(deck, vary.grid(["tumour.volume=150"]), [], 1, spaced)
     monkeypatch.setattr(sys, "prefix", str(tmp_path / "none"))
-    lines = [line for line in array.array_job(plan, "slurm").read_text().splitlines() if not line.startswith("#")]
+    lines = [line for line in array_job.write(plan, "slurm").read_text().splitlines() if not line.startswith("#")]
     begin = "\n".join(lines[: lines.index("launch=(srun --mpi=pmix)")])
     shell = ["env", "-i", "PATH=/usr/bin:/bin", "bash", "-c", f"{begin}\ncommand -v mpitled"]
     found = subprocess.run(shell, capture_output=True, text=True, check=True).stdout
@@ -255,18 +263,16 @@ def test_a_task_of_an_array_ends_in_order_before_its_time_is_up(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     deck, out = tmp_path / "scene.toml", tmp_path / "out"
     deck.write_text(GROWTH)
-    script, variables = array_job(tmp_path, deck, ["solver.load_time=50"], "tumour.volume=150", scheduler)
+    script, variables = write_array_job(tmp_path, deck, ["solver.load_time=50"], "tumour.volume=150", scheduler)
     hours, minutes, seconds = map(
         int, re.search(r"(?:time|walltime)=(\d+):(\d+):(\d+)$", script.read_text(), re.M).groups()
     )
     if scheduler == "pbs":
         (clock,) = re.findall(r"RUN_SECONDS:-(\d+)", script.read_text())
         assert int(clock) == 3600 * hours + 60 * minutes + seconds - 120
-    variables |= {"SLURM_ARRAY_TASK_ID": "1", "RUN_SECONDS": "10"}
+    variables |= {"SLURM_ARRAY_TASK_ID": "1", "RUN_SECONDS": "20"}
     with subprocess.Popen([script], env=variables, stderr=subprocess.PIPE, text=True) as process:
-        deadline = time.time() + 60
-        while not list(out.glob("*/result.partial.vtkhdf")) and time.time() < deadline:
-            time.sleep(0.02)
+        wait_until(lambda: list(out.glob("*/result.partial.vtkhdf")))
         time.sleep(0.5)
         if scheduler == "slurm":
             process.send_signal(signal.SIGUSR1)
@@ -281,19 +287,19 @@ def test_a_screen_has_bars_on_a_terminal_alone(monkeypatch):
             return True
 
     log = ["note: 3% of it", " 10%      9 s left  100 steps/s", " 45%      5 s left  100 steps/s", "written"]
-    assert screen.share_done(log) == 0.45
-    assert screen.share_done([]) == 0
-    for terminal in (True, False):
-        stream = Terminal() if terminal else io.StringIO()
+    assert terminal.share_done(log) == 0.45
+    assert terminal.share_done([]) == 0
+    line = f"[1 of 5 done] a=[1,2] {100 * 'long '}"
+    for stream in (Terminal(), io.StringIO()):
         monkeypatch.setattr(sys, "stderr", stream)
-        shown = screen.Screen()
-        shown.show({"a=1": 0.45, "a=2": 0.0}, 3)
-        shown.tell("[1 of 5 done] a=1")
+        screen = terminal.Screen()
+        screen.show({"a=[1,2]": 0.45, "a=2": 0.0}, 3)
+        screen.print(line, "green")
+        screen.show({}, 0)
         said = stream.getvalue()
-        assert ("\033[" in said) == terminal
-        assert (" 45% |" in said) == terminal
-        assert "[1 of 5 done] a=1" in said
-    assert said == "[1 of 5 done] a=1\n"
+        assert ("\033[" in said) == (" 45%" in said) == stream.isatty()
+        assert line in said
+    assert said == f"{line}\n"
 
 
 def test_what_cannot_be_swept_is_said_before_anything_runs(tmp_path):
@@ -343,22 +349,12 @@ def test_what_cannot_be_swept_is_said_before_anything_runs(tmp_path):
 def test_the_longest_cases_are_known_beforehand(tmp_path):
     brain = ROOT / "jobs" / "brain_tumour.toml"
     keys = ["labels.element_size=4,3", "tumour.volume=113.1,4188.8"]
-    work = {case.words: case.work for case in cases.plan(brain, vary.grid(keys), [], 1, tmp_path).cases}
+    work = {case.label: case.work for case in cases.plan(brain, vary.grid(keys), [], 1, tmp_path).cases}
     first, *_, last = sorted(work, key=lambda words: work[words])
     assert "=4 " in first
     assert "113.1" in first
     assert "=3 " in last
     assert "4188.8" in last
-
-
-def test_two_sweeps_do_not_work_in_one_folder(tmp_path):
-    fcntl = pytest.importorskip("fcntl")
-    shutil.rmtree(tmp_path / "out", ignore_errors=True)
-    (tmp_path / "out").mkdir()
-    with (tmp_path / "out" / ".lock").open("w") as held:
-        fcntl.flock(held, fcntl.LOCK_EX)
-        done = mpitled("sweep", CUBE, "--vary", "solver.load_steps=5", "--out", tmp_path / "out", status=2)
-    assert "another sweep is at work" in done.stderr
 
 
 def test_two_processes_do_not_compute_one_case(tmp_path):
@@ -368,11 +364,13 @@ def test_two_processes_do_not_compute_one_case(tmp_path):
     keys = ["block.elements=[2,2,2]", "solver.method=dynamic-relaxation"]
     plan = cases.plan(CUBE, vary.grid(["solver.load_steps=400,500"]), keys, 1, out)
     plan.write_manifest()
+    with lock.directory_lock(out, lock.RUN):
+        assert "another sweep is at work" in complaint(mpitled("sweep", out, status=2))
     busy, free = plan.cases
     for name in (lock.RUN, lock.TASK):
         busy.folder.mkdir(exist_ok=True)
         (busy.folder / "precious").touch()
-        with lock.held(busy.folder, name):
+        with lock.directory_lock(busy.folder, name):
             for words in (["--only", "1"], []):
                 line = complaint(mpitled("sweep", out, *words, status=2))
                 assert f"{busy.folder}: another run is at work there" in line
@@ -381,7 +379,7 @@ def test_two_processes_do_not_compute_one_case(tmp_path):
             complaint(mpitled("sweep", out, n=2, status=2))
         assert free.failure == ""
         shutil.rmtree(free.folder)
-    with lock.held(busy.folder, lock.RUN):
+    with lock.directory_lock(busy.folder, lock.RUN):
         for n in (1, 2):
             line = complaint(mpitled("run", CUBE, "--out", busy.folder, n=n, status=2))
             assert "another run is at work there; wait for its end, or give another --out" in line
@@ -389,12 +387,11 @@ def test_two_processes_do_not_compute_one_case(tmp_path):
     mpitled(*words)
     folder = next(study.glob("as*"))
     (folder / "done.json").unlink()
-    with lock.held(folder, lock.RUN):
+    with lock.directory_lock(folder, lock.RUN):
         assert "another run is at work" in complaint(mpitled(*words, status=2))
     assert (folder / "result.vtkhdf").exists()
 
-    command = [str(Path(sys.executable).with_name("mpitled")), "sweep", str(out), "--only", "1"]
-    twice = [subprocess.Popen(command, env=ENVIRONMENT, cwd=ROOT, stderr=subprocess.DEVNULL) for _ in range(2)]
+    twice = [start("sweep", out, "--only", 1) for _ in range(2)]
     assert sorted(process.wait(60) for process in twice) in ([0, 2], [0, 0])  # or the second finds it done
     assert busy.failure == ""
     assert json.loads((busy.folder / "report.json").read_text())["load_share"] == 1
@@ -528,11 +525,8 @@ def test_an_interrupted_case_goes_on_from_its_checkpoint(tmp_path):
     deck, out = tmp_path / "scene.toml", tmp_path / "out"
     deck.write_text(GROWTH)
     words = ["sweep", deck, "--vary", "tumour.volume=150", "--set", "solver.load_time=5", "--out", out]
-    command = [str(Path(sys.executable).with_name("mpitled")), *map(str, words)]
-    with subprocess.Popen(command, env=ENVIRONMENT, cwd=ROOT, stderr=subprocess.DEVNULL) as process:
-        deadline = time.time() + 60
-        while not list(out.glob("*/result.partial.vtkhdf")) and time.time() < deadline:
-            time.sleep(0.02)
+    with start(*words) as process:
+        wait_until(lambda: list(out.glob("*/result.partial.vtkhdf")))
         time.sleep(0.5)
         process.send_signal(signal.SIGTERM)
     assert process.returncode == 4
