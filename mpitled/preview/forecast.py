@@ -1,4 +1,4 @@
-"""What a run will take: steps and surveys, the time of each, measured on the model itself, and room on the disc."""
+"""What a run will take: its steps and stability checks, their times as measured on the model, and space on the disc."""
 
 from __future__ import annotations
 
@@ -19,64 +19,65 @@ from mpitled.solver.central_difference import March
 from mpitled.solver.dynamic_relaxation import Relaxation
 from mpitled.solver.run import cell_data
 
-#: Times that each term is called to tell how long it takes; the fastest counts, for others may use the machine too.
+#: Calls of each term; the fastest counts, because other processes may use the machine as well.
 CALLS = 9
 
 
 class Forecast(NamedTuple):
-    """Steps and times of the loop, and the result's size; building, pictures and a ramp's way to rest come on top."""
+    """Steps and times of the loop, and the size of the result; without building, pictures and a ramp's relaxation."""
 
     steps: int
-    surveys: int
-    at_least: bool  # whether the method goes on until it is at rest, which nobody knows beforehand
+    checks: int
+    at_least: bool  # whether the method goes on until it is at rest
     step_s: float
-    survey_s: float
+    check_s: float
     output_bytes: int
 
     @property
     def loop_s(self) -> float:
-        return self.steps * self.step_s + self.surveys * self.survey_s
+        """Time of the loop, s."""
+        return self.steps * self.step_s + self.checks * self.check_s
 
     def describe(self) -> str:
-        """In a line."""
+        """One line."""
         least = "at least " if self.at_least else ""
         steps = f"{least}{self.steps} steps of {1e3 * self.step_s:.2g} ms, so {least}{self.loop_s:.2g} s of stepping"
         return f"{steps}, on one rank here; {resources.told(self.output_bytes)} of results"
 
 
 def measure(method: March | Relaxation) -> tuple[dict[str, float], float]:
-    """Seconds that each term of a step takes on the state that the method has, and those of a survey."""
+    """Seconds of each term of a step at the current state, and of a stability check."""
     terms = (*method.forces, *method.motion)
     seconds: dict[str, float] = dict.fromkeys((name for name, _ in terms), math.inf)
     for _ in range(CALLS):
         step = dict.fromkeys(seconds, 0.0)
-        for name, act in terms:  # in their order: the halo's end needs its beginning
+        for name, act in terms:  # in their order: the exchange ends after it begins
             step[name] += _seconds(partial(act, method.state))
         seconds = {name: min(least, step[name]) for name, least in seconds.items()}
     return seconds, min(_seconds(method.look) for _ in range(CALLS))
 
 
-def expect(method: March | Relaxation, step: float, survey: float, output_bytes: int) -> Forecast:
-    """What a method that is ready to begin will take, at so many seconds a step and a survey."""
+def expect(method: March | Relaxation, step: float, check: float, output_bytes: int) -> Forecast:
+    """The forecast for a method before its first step; step and check in s."""
     at_least = isinstance(method, Relaxation)
-    return Forecast(method.expected_steps, method.expected_surveys, at_least, step, survey, output_bytes)
+    return Forecast(method.expected_steps, method.expected_surveys, at_least, step, check, output_bytes)
 
 
 def forecast(deck: Deck, model: Model) -> Forecast:
-    """What a run takes on one rank of this machine. InputError if the deck's step is too long for the model."""
-    with tempfile.TemporaryDirectory() as folder:  # ranks read their part from a file, and so does this one
+    """The forecast for a run on one rank of this machine. InputError if the deck's step is too long for the model."""
+    with tempfile.TemporaryDirectory() as folder:  # a rank reads its part of a model from a file
         path = Path(folder) / "model.h5"
         store.write_model(path, model, "")
         sub, method = first_rank(deck, path)
     method.warm_up()
     method.begin()
-    seconds, survey = measure(method)
+    seconds, check = measure(method)
     size = store.result_bytes(sub.rows, deck.output.frames + 1, cell_data(deck))
-    return expect(method, sum(seconds.values()), survey, size)
+    return expect(method, sum(seconds.values()), check, size)
 
 
 def first_rank(deck: Deck, path: Path, ranks: int = 1) -> tuple[Subdomain, March | Relaxation]:
-    """The part of rank 0 of a model that is cut for so many, and its method at rest, which does without the others."""
+    """The part of rank 0 of a partitioned model, and its method without other ranks, before its first step."""
     rows, figures = store.read_part(path, ranks, 0), store.read_figures(path)
     solver, frames, world = deck.solver, deck.output.frames, World()
     hourglass, rule, precision = deck.hexahedra.hourglass, deck.hexahedra.gradient, PRECISIONS[solver.precision]
