@@ -156,7 +156,6 @@ def test_the_shell_completes_commands_and_keys(tmp_path):
         ("mpitled run --set solver.method=dyn", "dynamic-relaxation"),
         ("mpitled run --set output.pictures=", "false"),
         (f"mpitled sweep {CUBE} --vary material.", "material.brain.youngs_modulus="),
-        ("mpitled stability --only lo", "locking"),
     ):
         told = tmp_path / "told"
         shell = {
