@@ -159,26 +159,21 @@ def test_charts_show_what_differs_by_names_that_fit(tmp_path, groups, monkeypatc
 
     from mpitled.results import charts
 
-    def drawn(table: summary.Table) -> tuple[list[str], list[str], list[str]]:
-        figures: list[Figure] = []
-        names: list[str] = []
-        monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: figures.append(self))
-        monkeypatch.setattr(charts, "draw_cost", lambda points, _: names.extend(name for *_, name in points))
-        summary._draw(table, tmp_path)
-        (figure,) = figures
-        labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
-        return [axes.get_ylabel() for axes in figure.axes], labels, names
-
+    figures: list[Figure] = []
+    names: list[str] = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: figures.append(self))
+    monkeypatch.setattr(charts, "draw_cost", lambda points, _: names.extend(name for *_, name in points))
     table = summary.collect(cases.read(groups[0]))
-    rows = [row | {"cloud_misfit_mm": 0.0, "warnings": ""} for row in table.rows]
-    panels, labels, names = drawn(table._replace(rows=rows))
+    nu = "material.brain.poissons_ratio"
+    rows = [row | {"cloud_misfit_mm": 0.0, "warnings": "", nu: 0.45} for row in table.rows]
+    summary._draw(table._replace(rows=rows), tmp_path)
+    panels = [axes.get_ylabel() for axes in figures[0].axes]
     assert "largest displacement, mm" in panels
     assert "misfit of cloud, mm" not in panels  # zero everywhere
-    assert labels == []  # one series
+    assert figures[0].legends == []  # one series
     assert names == ["400", "500"]
-    nu = "material.brain.poissons_ratio"
-    rows = [row | {nu: 0.45} for row in rows]
-    assert drawn(table._replace(keys=[*table.keys, nu], rows=rows))[2][0] == "load_steps=400 poissons_ratio=0.45"
+    summary._draw(table._replace(keys=[*table.keys, nu], rows=rows), tmp_path)
+    assert names[2] == "load_steps=400 poissons_ratio=0.45"
 
 
 def write_array_job(
@@ -219,26 +214,25 @@ def test_an_array_job_computes_each_task_alone(tmp_path, monkeypatch):
 
 
 def test_an_array_job_fits_its_sweep(tmp_path, monkeypatch):
-    """Number of ranks, logs beside a path's blanks, no script of another plan, and a program that is found."""
+    """Number of ranks, logs in a path with blanks, no script of another plan, and a program that is found."""
     deck, out, spaced = tmp_path / "scene.toml", tmp_path / "out", tmp_path / "my 50% files"
     deck.write_text(GROWTH)
-    words = ["sweep", deck, "--vary", "tumour.volume=150,300"]
-    mpitled(*words, "--out", out, "--scheduler", "pbs")
-    mpitled(*words, "--out", out, "--scheduler", "slurm")
+    words = ["sweep", deck, "--vary", "tumour.volume=150,300", "--out"]
+    for scheduler in ("pbs", "slurm"):
+        mpitled(*words, out, "--scheduler", scheduler)
     assert (out / "pbs.sh").exists()
-    mpitled(*words, "--out", out, "--scheduler", "slurm", "--ranks", 2)
+    mpitled(*words, out, "--scheduler", "slurm", "--ranks", 2)
     assert not (out / "pbs.sh").exists()
     line = complaint(mpitled("sweep", out, "--only", 1, n=4, status=2))
     assert "--only 1: has 2 ranks a case, and 4 started; start as many" in line
-    monkeypatch.setenv("OMPI_COMM_WORLD_SIZE", "1")
-    assert "and 1 started" in complaint(mpitled("sweep", out, "--only", 1, status=2))
-    monkeypatch.delenv("OMPI_COMM_WORLD_SIZE")
+    with monkeypatch.context() as patch:
+        patch.setenv("OMPI_COMM_WORLD_SIZE", "1")
+        assert "and 1 started" in complaint(mpitled("sweep", out, "--only", 1, status=2))
 
-    script = Path(mpitled(*words, "--out", spaced, "--scheduler", "slurm").stdout.strip())
-    log = f"{tmp_path}/my 50%% files/slurm-%A_%a.log"
-    assert f'#SBATCH --output="{log}"' in script.read_text()
-    assert "pbs takes no such path" in complaint(mpitled(*words, "--out", spaced, "--scheduler", "pbs", status=2))
-    # Submitted from any folder, by a shell that knows of no program.
+    script = Path(mpitled(*words, spaced, "--scheduler", "slurm").stdout.strip())
+    assert f'#SBATCH --output="{tmp_path}/my 50%% files/slurm-%A_%a.log"' in script.read_text()
+    assert "pbs takes no such path" in complaint(mpitled(*words, spaced, "--scheduler", "pbs", status=2))
+    # Submitted from any folder, by a shell that does not have the program in its path.
     monkeypatch.chdir(tmp_path)
     plan = cases.plan(deck, vary.grid(["tumour.volume=150"]), [], 1, spaced)
     monkeypatch.setattr(sys, "prefix", str(tmp_path / "none"))
@@ -249,10 +243,9 @@ def test_an_array_job_fits_its_sweep(tmp_path, monkeypatch):
     assert found.strip() == str(Path(sys.executable).with_name("mpitled"))
 
 
-def test_a_reason_is_no_rule_of_a_banner(tmp_path):
-    """mpirun frames what it has to say."""
-    words = ["sh", "-c", "echo there are not enough slots; echo; echo ------; exit 1"]
-    process = launch.Process(words, tmp_path)
+def test_the_reason_of_a_failure_is_the_last_line_with_words(tmp_path):
+    """mpirun frames its messages."""
+    process = launch.Process(["sh", "-c", "echo there are not enough slots; echo; echo ------; exit 1"], tmp_path)
     process.ended()
     assert process.failure == "there are not enough slots"
 
@@ -303,58 +296,51 @@ def test_a_screen_has_bars_on_a_terminal_alone(monkeypatch):
 
 
 def test_what_cannot_be_swept_is_said_before_anything_runs(tmp_path):
-    def plan(*texts: str) -> cases.Sweep:
-        return cases.plan(CUBE, vary.grid(texts), [], 1, tmp_path / "out")
+    table, out = tmp_path / "cases.csv", tmp_path / "out"
+    good = "solver.load_steps,solver.tolerance\n5,\n6,0.1\n"
 
-    for texts, word in (
+    def plan(text: str) -> cases.Sweep:
+        table.write_text(text)
+        return cases.plan(CUBE, vary.table(table), [], 1, out)
+
+    for texts, message in (
         (["solver.load_step=1,2"], "did you mean load_steps"),
         (["solver.load_steps"], "key=value"),
         (["a=1,2+b=3"], "as many values"),
         (["solver.load_steps=5", "solver.load_steps=6"], "varied twice"),
         (["solver.load_steps=5,5"], "cases 1 and 2 are the same"),
     ):
-        with pytest.raises(InputError, match=word):
-            plan(*texts)
-    table = tmp_path / "cases.csv"
-    for text, word in (
+        with pytest.raises(InputError, match=message):
+            cases.plan(CUBE, vary.grid(texts), [], 1, out)
+    for text, message in (
         ("", "has no cases"),
         ("a,a\n1,2\n", "a key twice"),
         ("a,b\n1\n", "line 2: has 1 values for 2 keys"),
         ("a;b\n1,5;2\n", "line 1: separate by commas, not semicolons"),
-    ):
-        table.write_text(text)
-        with pytest.raises(InputError, match=word):
-            vary.table(table)
-    table.write_text("solver.load_steps,solver.tolerance\n5,\n6,0.1\n")
-    values = vary.table(table)
-    assert values == [{"solver.load_steps": "5"}, {"solver.load_steps": "6", "solver.tolerance": "0.1"}]
-    for text, word in (
         ("# of today\nsolver.load_step\n\n5\n", "line 4: solver.load_step = 5: unknown key; did you mean load_steps"),
         ("solver.load_steps\n5\n#6\n5\n", "line 4: cases 1 and 2 are the same"),
     ):
+        with pytest.raises(InputError, match=f"{table}: {message}"):
+            plan(text)
+    sweep = plan(good)
+    assert [dict(case.values) for case in sweep.cases] == [
+        {"solver.load_steps": "5"}, {"solver.load_steps": "6", "solver.tolerance": "0.1"}
+    ]  # fmt: skip
+    for text, message in (("solver.load_steps\n", "no column solver.tolerance"), (f"x,{good}", "x is no column")):
         table.write_text(text)
-        with pytest.raises(InputError, match=f"{table}: {word}"):
-            cases.plan(CUBE, vary.table(table), [], 1, tmp_path / "out")
-    table.write_text("solver.load_steps,solver.tolerance\n5,\n6,0.1\n")
-    sweep = cases.plan(CUBE, values, [], 1, tmp_path / "out")
-    for text, word in (("solver.load_steps\n", "no column solver.tolerance"), ("x\n", "no column")):
-        table.write_text(text)
-        with pytest.raises(InputError, match=word):
+        with pytest.raises(InputError, match=message):
             summary.collect(sweep, table)
-    assert not (tmp_path / "out").exists()
+    assert not out.exists()
     with pytest.raises(InputError, match="holds no sweep"):
         cases.read(tmp_path)
 
 
 def test_the_longest_cases_are_known_beforehand(tmp_path):
-    brain = ROOT / "jobs" / "brain_tumour.toml"
-    keys = ["labels.element_size=4,3", "tumour.volume=113.1,4188.8"]
-    work = {case.label: case.work for case in cases.plan(brain, vary.grid(keys), [], 1, tmp_path).cases}
-    first, *_, last = sorted(work, key=lambda words: work[words])
-    assert "=4 " in first
-    assert "113.1" in first
-    assert "=3 " in last
-    assert "4188.8" in last
+    brain, keys = ROOT / "jobs" / "brain_tumour.toml", ["labels.element_size=4,3", "tumour.volume=113.1,4188.8"]
+    plan = cases.plan(brain, vary.grid(keys), [], 1, tmp_path)
+    first, *_, last = sorted(plan.cases, key=lambda case: case.work)
+    assert list(first.values.values()) == ["4", "113.1"]
+    assert list(last.values.values()) == ["3", "4188.8"]
 
 
 def test_two_processes_do_not_compute_one_case(tmp_path):
@@ -428,41 +414,41 @@ def test_a_folder_that_cannot_be_made_is_said_in_a_line(tmp_path, words):
     assert f"{out}: cannot be made" in complaint(mpitled(*command, "--out", out, status=2))
 
 
-def test_another_sweep_does_not_take_the_place_of_a_table(tmp_path):
-    """The same goes on and takes more values in; a study alike."""
+@pytest.mark.parametrize("command", ["sweep", "study"])
+def test_a_table_is_not_replaced_by_another_one(tmp_path, command):
+    """The same command resumes, and may add values."""
     deck, out = tmp_path / "scene.toml", tmp_path / "out"
     text = f"{block((20, 20, 20), (2, 2, 2))}{pulled(0.1)}"
     deck.write_text(text)
     nu = "material.brain.poissons_ratio"
-    for command, table in (("sweep", "table.csv"), ("study", "study.csv")):
-        words = [command, deck, "--out", out / command, "--set", "solver.load_steps=60"]
-        for values in ("0.3,0.4", "0.3,0.4", "0.45,0.4,0.3"):
-            mpitled(*words, "--vary", f"{nu}={values}")
-        kept = (out / command / table).read_bytes()
-        for others, why in (
-            ([*words, "--vary", f"{nu}=0.3,0.45"], f"with {nu}=0.4;"),
-            ([*words, "--vary", "hexahedra.hourglass=0.01"], f"over {nu};"),
-            ([*words, "--set", "solver.tolerance=0.1", "--vary", f"{nu}=0.3"], "with --set solver.load_steps=60;"),
-        ):
-            line = complaint(mpitled(*others, status=2))
-            assert f"holds the table of another {command}, {why}" in line
-            assert f"remove {out / command / command}.json to replace it" in line
-        deck.write_text(text.replace("3000", "4000"))
-        line = complaint(mpitled(*words, "--vary", f"{nu}=0.3,0.4,0.45", status=2))
-        assert "of the deck before it or a file that it reads was changed" in line
-        if command == "sweep":  # which can still be read
-            assert "was changed since" in complaint(mpitled("sweep", out / "sweep", status=2))
-            for change in (lambda: None, deck.unlink):
-                change()
-                done = mpitled("report", out / "sweep")
-                assert f"note: {out / 'sweep'}: {deck}, or a file that it reads, is not what was swept" in done.stderr
-                assert (out / command / table).read_bytes() == kept
-                assert [row[nu] for row in open_sweep(out / "sweep")] == [0.45, 0.4, 0.3]
-        deck.write_text(text)
-        assert (out / command / table).read_bytes() == kept
-        (out / command / f"{command}.json").unlink()
-        mpitled(*words, "--vary", f"{nu}=0.3")
-        assert (out / command / table).read_bytes().count(b"\n") < kept.count(b"\n")
+    words = [command, deck, "--out", out, "--set", "solver.load_steps=60"]
+    for values in ("0.3,0.4", "0.3,0.4", "0.45,0.4,0.3"):
+        mpitled(*words, "--vary", f"{nu}={values}")
+    table = out / {"sweep": "table.csv", "study": "study.csv"}[command]
+    kept = table.read_bytes()
+    for others, why in (
+        ([*words, "--vary", f"{nu}=0.3,0.45"], f"with {nu}=0.4;"),
+        ([*words, "--vary", "hexahedra.hourglass=0.01"], f"over {nu};"),
+        ([*words, "--set", "solver.tolerance=0.1", "--vary", f"{nu}=0.3"], "with --set solver.load_steps=60;"),
+    ):
+        line = complaint(mpitled(*others, status=2))
+        assert f"holds the table of another {command}, {why}" in line
+        assert f"remove {out / command}.json to replace it" in line
+    deck.write_text(text.replace("3000", "4000"))
+    line = complaint(mpitled(*words, "--vary", f"{nu}=0.3,0.4,0.45", status=2))
+    assert "of the deck before it or a file that it reads was changed" in line
+    if command == "sweep":  # its table can still be read
+        assert "was changed since" in complaint(mpitled("sweep", out, status=2))
+        for change in (lambda: None, deck.unlink):
+            change()
+            note = f"note: {out}: {deck}, or a file that it reads, is not what was swept"
+            assert note in mpitled("report", out).stderr
+            assert [row[nu] for row in open_sweep(out)] == [0.45, 0.4, 0.3]
+    assert table.read_bytes() == kept
+    deck.write_text(text)
+    (out / f"{command}.json").unlink()
+    mpitled(*words, "--vary", f"{nu}=0.3")
+    assert table.read_bytes().count(b"\n") < kept.count(b"\n")
 
 
 GROWTH = f"""{TUMOUR}
@@ -508,17 +494,16 @@ def test_one_growth_passes_through_what_runs_of_their_own_find(tmp_path):
     assert told[20000.0] == told[33000.0]
 
 
-def test_one_growth_is_for_slow_loading_to_volumes(tmp_path):
-    deck = tmp_path / "scene.toml"
+@pytest.mark.parametrize(("words", "reason"), [
+    (["--vary", "cloud.growth=0.3,0.4"], "tumour.volume alone"),
+    (["--vary", "tumour.volume=100,200", "--set", "solver.method=dynamic"], "not near rest"),
+    (["--vary", "tumour.volume=100,200", "--scheduler", "slurm"], "no array of jobs"),
+])  # fmt: skip
+def test_one_growth_is_for_slow_loading_to_volumes(tmp_path, words, reason):
+    deck, out = tmp_path / "scene.toml", tmp_path / "out"
     deck.write_text(GROWTH)
-    for words, reason in (
-        (["--vary", "cloud.growth=0.3,0.4"], "tumour.volume alone"),
-        (["--vary", "tumour.volume=100,200", "--set", "solver.method=dynamic"], "not near rest"),
-        (["--vary", "tumour.volume=100,200", "--scheduler", "slurm"], "no array of jobs"),
-    ):
-        done = mpitled("sweep", deck, *words, "--one-growth", "--out", tmp_path / "out", status=2)
-        assert reason in complaint(done)
-    assert not (tmp_path / "out").exists()
+    assert reason in complaint(mpitled("sweep", deck, *words, "--one-growth", "--out", out, status=2))
+    assert not out.exists()
 
 
 def test_an_interrupted_case_goes_on_from_its_checkpoint(tmp_path):
