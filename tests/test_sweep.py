@@ -41,7 +41,7 @@ def groups(tmp_path_factory):
     return out, mpitled(*WORDS, "--out", out, n=2, status=3).stderr
 
 
-def wait_until(condition: Callable[[], object], seconds: float = 60) -> None:
+def wait_until(condition: Callable[[], object], seconds: float = 120) -> None:
     deadline = time.time() + seconds
     while not condition() and time.time() < deadline:
         time.sleep(0.02)
