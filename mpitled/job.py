@@ -20,7 +20,7 @@ from mpitled.solver import checkpoint
 from mpitled.solver.progress import Interrupts, Phases
 from mpitled.solver.run import Run
 
-MODEL, PAGE = "model.h5", "report.html"
+MODEL = "model.h5"
 #: Said of a run that is at its end.
 DONE = "done"
 
@@ -101,13 +101,13 @@ def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False, resum
 
 def _report(directory: Path, world: World, seconds: Mapping[str, float] | None = None) -> dict[str, Any]:
     """Of a run that is at its end, whose checkpoints nobody needs any more."""
-    from mpitled.results import report
+    from mpitled.results import page, report
 
     def write() -> dict[str, Any]:
         store.discard_checkpoints(directory)
         if seconds is not None:  # of a result that took the place of another
-            with atomic.writing(directory / PAGE):
-                (directory / PAGE).unlink(missing_ok=True)
+            with atomic.writing(directory / page.PAGE):
+                (directory / page.PAGE).unlink(missing_ok=True)
         return report.write(directory, seconds)
 
     return dict(world.on_leader(write))
@@ -131,13 +131,13 @@ def _refuse_to_lose(deck: Deck, directory: Path) -> None:
     found = checkpoint.newest(directory)
     if found is None:
         return
-    if other := checkpoint.other(found.told, deck, decks.model_key(deck, included(deck))):
+    if other := checkpoint.other(found.contents, deck, decks.model_key(deck, included(deck))):
         raise InputError(
-            f"{found.path}: holds a run {checkpoint.reached(found.told)} that {other}; give this one another folder "
-            "with --out, or remove the file"
+            f"{found.path}: holds a run {checkpoint.reached(found.contents)} that {other}; give this one another "
+            "folder with --out, or remove the file"
         )
     raise InputError(
-        f"{found.path}: holds this very run {checkpoint.reached(found.told)}; go on from there with --resume, or "
+        f"{found.path}: holds this very run {checkpoint.reached(found.contents)}; go on from there with --resume, or "
         "remove the file to begin anew"
     )
 
@@ -157,7 +157,7 @@ def prepare(
             world.on_leader(lambda: ensure_partition(path, world.size, deck.partition.seed, quiet))
         mark = world.on_leader(lambda: store.partition_mark(path, world.size))
     with everywhere():
-        if found and found.told["ranks"] == world.size and found.told["partition"] != mark:
+        if found and found.contents["ranks"] == world.size and found.contents["partition"] != mark:
             raise InputError(
                 f"{found.path}: was written for another partition in {world.size} parts; partition the model with the "
                 "seed that it had, go on with another number of ranks, or begin anew without --resume"

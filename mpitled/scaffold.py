@@ -1,134 +1,102 @@
-"""`mpitled new`: a deck to begin with, whose sections, units, defaults and comments are those that deck.py declares."""
+"""`mpitled new`: a first deck, whose comments, units and defaults are those of the deck's schema."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
+
+import tomlkit
 
 from mpitled import atomic, deck, toml
 from mpitled.errors import InputError
 
 #: A label image that a clone of the repository has; others give their own.
 _IMAGE = Path(__file__).parents[1] / "jobs" / "data" / "mni152_labels_1mm.nii.gz"
-_MATERIAL: dict[str, Any] = {"youngs_modulus": 3000.0, "poissons_ratio": 0.49}
-_FIXED = ("[[fixed]]", {"nodes": "surface"})
-_BRAIN = ("[material.brain]", _MATERIAL)
-#: The block whose meshes go with a deck of decks.
-_SAMPLE = """[block]
-size = [40.0, 20.0, 20.0]
-elements = [8, 5, 5]
-cloud = "core"
-[material.brain]
-youngs_modulus = 3000.0
-poissons_ratio = 0.49
-[[fixed]]
-nodes = "x0"
-"""
-
-#: What is not left at its default, by kind and heading, in the order of the deck.
-_SCENES: Mapping[str, tuple[tuple[str, dict[str, Any]], ...]] = {
-    "brain": (
-        ("[labels]", {}),
-        ("[tumour]", {"centre": (-32.0, -20.0, 10.0), "volume": 4188.8, "surface_nodes": 1600}),
-        ("[material.brain]", _MATERIAL | {"cells": ("tissue",)}),
-        (
-            "[material.csf]",
-            {"youngs_modulus": 10.0, "poissons_ratio": 0.1, "cells": ("left_ventricle", "right_ventricle")},
-        ),
-        ("[[fixed]]", {"nodes": "skull"}),
-    ),
-    "decks": (
-        ("[mesh]", {}),
-        _BRAIN,
-        ("[[fixed]]", {"nodes": "x0"}),
-        ("[[displaced]]", {"nodes": "x1", "displacement": (4.0, 0.0, 0.0)}),
-    ),
-    "block": (
-        ("[block]", {"size": (48.0, 40.0, 40.0), "elements": (12, 10, 10), "cloud": "core"}),
-        ("[tumour]", {"centre": (24.0, 20.0, 20.0), "volume": 523.6}),
-        ("[cloud]", {"radius": 11.0}),
-        _BRAIN,
-        _FIXED,
-    ),
-    "cylinder": (
-        ("[cylinder]", {"radius": 20.0, "height": 40.0, "cloud": "core"}),
-        _BRAIN,
-        ("[[fixed]]", {"nodes": "bottom"}),
-        ("[[displaced]]", {"nodes": "top", "displacement": (0.0, 0.0, 4.0)}),
-    ),
-    "ellipsoid": (
-        ("[ellipsoid]", {"semi_axes": (40.0, 32.0, 32.0), "cloud": "core"}),
-        ("[tumour]", {"centre": (0.0, 0.0, 0.0), "volume": 523.6}),
-        _BRAIN,
-        _FIXED,
-    ),
+_BRAIN = "material.brain = {youngs_modulus = 3000.0, poissons_ratio = 0.49}"
+#: The values that are not defaults, by kind of scene.
+_SCENES = {
+    "brain": """
+tumour = {centre = [-32.0, -20.0, 10.0], volume = 4188.8, surface_nodes = 1600}
+material.brain = {youngs_modulus = 3000.0, poissons_ratio = 0.49, cells = ["tissue"]}
+material.csf = {youngs_modulus = 10.0, poissons_ratio = 0.1, cells = ["left_ventricle", "right_ventricle"]}
+fixed = [{nodes = "skull"}]""",
+    "decks": f"""{_BRAIN}
+fixed = [{{nodes = "x0"}}]
+displaced = [{{nodes = "x1", displacement = [4.0, 0.0, 0.0]}}]""",
+    "block": f"""{_BRAIN}
+block = {{size = [48.0, 40.0, 40.0], elements = [12, 10, 10], cloud = "core"}}
+tumour = {{centre = [24.0, 20.0, 20.0], volume = 523.6}}
+cloud = {{radius = 11.0}}
+fixed = [{{nodes = "surface"}}]""",
+    "cylinder": f"""{_BRAIN}
+cylinder = {{radius = 20.0, height = 40.0, cloud = "core"}}
+fixed = [{{nodes = "bottom"}}]
+displaced = [{{nodes = "top", displacement = [0.0, 0.0, 4.0]}}]""",
+    "ellipsoid": f"""{_BRAIN}
+ellipsoid = {{semi_axes = [40.0, 32.0, 32.0], cloud = "core"}}
+tumour = {{centre = [0.0, 0.0, 0.0], volume = 523.6}}
+fixed = [{{nodes = "surface"}}]""",
 }
-#: Sections for which there is nothing to choose, shown with their defaults; the first are of scenes with a cloud.
-_REST = ("[cloud]", "[support]", "[hexahedra]", "[solver]", "[output]", "[partition]")
+#: The block whose meshes are written beside a deck of meshes.
+_SAMPLE = f"""{_BRAIN}
+block = {{size = [40.0, 20.0, 20.0], elements = [8, 5, 5], cloud = "core"}}
+fixed = [{{nodes = "x0"}}]"""
+#: Sections that every deck shows, with their defaults if there is nothing to choose.
+_SHOWN = ("cloud", "support", "hexahedra", "solver", "output", "partition")
 
 
 def write(kind: str, path: Path) -> list[Path]:
-    """Write a deck, and meshes if it needs some to begin with; the paths. InputError if it is there already."""
+    """Write a deck, and the meshes that it reads; their paths. InputError if the deck exists already."""
     if path.exists():
         raise InputError(f"{path}: is there already; give another name, or remove it")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from None
-    meshes = _meshes(path.with_name(f"{path.stem}_mesh")) if kind == "decks" else []
+    meshes = _write_meshes(path.with_name(f"{path.stem}_mesh")) if kind == "decks" else []
     atomic.write_text(path, text(kind, path, meshes))
     return [path, *meshes]
 
 
 def text(kind: str, path: Path, meshes: Sequence[Path] = ()) -> str:
-    """The deck for a path, with the meshes that it reads; InputError if it reads some and there are none."""
-    geometry = {}
+    """The deck for a path; InputError if it reads meshes and none are given."""
+    scene: dict[str, Any] = tomlkit.parse(_SCENES[kind]).unwrap()
     if kind == "brain":
-        geometry = {"image": os.path.relpath(_IMAGE, path.parent) if _IMAGE.exists() else "labels.nii.gz"}
+        scene["labels"] = {"image": os.path.relpath(_IMAGE, path.parent) if _IMAGE.exists() else "labels.nii.gz"}
     elif kind == "decks":
         if not meshes:
             raise InputError("new decks: meshes are written beside the deck; give a file, not -")
         keys = ("fe", "efg", "integration_points", "surface_areas")
-        geometry = {key: f"{mesh.parent.name}/{mesh.name}" for key, mesh in zip(keys, meshes, strict=True)}
-    (heading, chosen), *others = _SCENES[kind]
-    scene = [(heading, chosen | geometry), *others]
-    given = {name for name, _ in scene}
-    scene += [(name, {}) for name in _REST if name not in given]
-    about_top, top = deck.declared("the top of the deck")
+        scene["mesh"] = {key: f"{mesh.parent.name}/{mesh.name}" for key, mesh in zip(keys, meshes, strict=True)}
     lines = [
-        f"# A scene of mpitled to begin with ({kind}). A key behind # has its default: take the # away to change it.",
-        f"# 'mpitled check {path.name}' says what is in it, 'mpitled run {path.name}' computes it.{about_top}",
-        *_key("title", top["title"], f"A scene of kind {kind}"),
+        f"# A first scene of mpitled ({kind}). A key behind # has its default: remove the # to change it.",
+        f"# 'mpitled check {path.name}' shows what is in it, 'mpitled run {path.name}' computes it.",
+        *_keys("", {"title": f"A scene of kind {kind}"}),
     ]
-    for name, values in scene:
-        lines += ["", *_section(name, values)]
+    for home in deck.homes()[1:]:
+        given = scene.get(home.section, {} if home.section in _SHOWN else None)
+        if given is not None and not home.law:
+            entries = dict(enumerate(given)) if isinstance(given, list) else given if home.depth == 3 else {"": given}
+            for name, values in entries.items():
+                heading = home.heading.replace("NAME", str(name))
+                lines += ["", f"# {home.about}", heading, *_keys(home.section, values)]
     return "\n".join(lines) + "\n"
 
 
-def _section(heading: str, values: Mapping[str, Any]) -> Iterator[str]:
-    """A section with all of its keys."""
-    about, keys = deck.declared("[material.NAME]" if heading.startswith("[material.") else heading)
-    yield f"# {about}"
-    yield heading
-    for written, key in keys.items():
-        yield from _key(written, key, values.get(written))
+def _keys(section: str, values: dict[str, Any]) -> Iterator[str]:
+    """Every key of a section with its meaning; as a comment if its value is not given."""
+    for name, key in deck.keys_of(section).items():
+        yield f"# {key['description']}; {deck.expected(key)}"
+        default = toml.value(key["default"]) if "default" in key else ""
+        yield f"{name} = {toml.value(values[name])}" if name in values else f"# {name} = {default}".rstrip()
 
 
-def _key(written: str, key: deck.Declared, value: Any) -> Iterator[str]:
-    """A key with what it means; as a comment if nothing is given."""
-    yield f"# {key.meaning}; {key.expected}"
-    if value is not None:
-        yield f"{written} = {toml.value(value)}"
-    else:  # an empty list stands for what is not given
-        yield f"# {written} = {'' if key.default in (None, ()) else toml.value(key.default)}".rstrip()
-
-
-def _meshes(folder: Path) -> list[Path]:
-    """The meshes of a small block with a cloud, where a user's own will be."""
+def _write_meshes(folder: Path) -> list[Path]:
+    """The meshes of a small block with a cloud, in place of a user's own."""
     from mpitled import export, store
     from mpitled.model import build as model_build
 

@@ -338,7 +338,8 @@ def _model(path: Path) -> object:
     from mpitled.deck import Solver
     from mpitled.parallel.halo import World
     from mpitled.parallel.subdomain import localise
-    from mpitled.solver.central_difference import March
+    from mpitled.solver.integrators import make_integrator
+    from mpitled.terms import Scene
 
     info.contents(path)
     store.read_model(path)
@@ -349,9 +350,10 @@ def _model(path: Path) -> object:
             localise(store.read_part(path, 2, part), 0.004, 0.1, "mean")
     sub = localise(store.read_part(path, 1, 0), 0.004, 0.1, "mean")
     with np.errstate(all="ignore"):
-        march = March(Solver(), 1, sub, World(), None, None, store.read_figures(path))
-        march.warm_up()
-    return march
+        solver = Solver(method="dynamic")
+        integrator = make_integrator(Scene(sub, solver), 1, World(), store.read_figures(path))
+        integrator.warm_up()
+    return integrator
 
 
 def _checkpoint(path: Path) -> object:

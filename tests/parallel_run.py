@@ -23,9 +23,9 @@ def main(deck: Path, directory: Path) -> None:
 
     job.Run = Watched  # type: ignore[misc]
     job.run(load_deck(deck), directory, world, quiet=True)
-    state, shared = loops[0].method.state, loops[0].sub.shared
+    state, shared = loops[0].integrator.state, loops[0].sub.shared
     compared = 0
-    for values in (state.u, state.u_prev, np.atleast_2d(state.mobility)):
+    for values in (state.u, state.u_prev, np.atleast_2d(state.dt2_over_m)):
         mine = {rank: np.ascontiguousarray(values[:, nodes]) for rank, nodes in shared}
         theirs = {rank: np.empty_like(block) for rank, block in mine.items()}
         requests = [world.comm.Irecv(block, rank) for rank, block in theirs.items()]

@@ -3,6 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
+
+from mpitled.deck import Solver
+from mpitled.parallel.halo import World
+from mpitled.parallel.subdomain import Subdomain
+from mpitled.solver.integrators import make_integrator
+from mpitled.terms import Scene, Step
 
 
 def block(size: Sequence[float], elements: Sequence[int], cloud: str = "none", nu: float = 0.3) -> str:
@@ -45,3 +52,13 @@ growth = 0.35
 [[fixed]]
 nodes = "surface"
 """ + block((48, 40, 40), (12, 10, 10), "core", 0.49)
+
+
+def step_of(sub: Subdomain, method: Any = "quasi-static") -> Step:
+    """The composed step of a part on one rank."""
+    return Step(Scene(sub, Solver(method=method)))
+
+
+def integrator_of(sub: Subdomain, solver: Solver, model: dict[str, Any] | None = None) -> Any:
+    """The integrator of a part on one rank, at rest. model: figures of the model, where the solver is no relaxation."""
+    return make_integrator(Scene(sub, solver), 1, World(), model or {})

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 from conftest import ROOT, mpitled
+from scenes import integrator_of
 
 from mpitled import store
 from mpitled.deck import load_deck
 from mpitled.model import build as model_build
-from mpitled.parallel.halo import World
 from mpitled.parallel.subdomain import localise
 from mpitled.results import compare
-from mpitled.solver.dynamic_relaxation import Relaxation
+from mpitled.terms import apply
 
 SIZE = 0.06  # m
 BLOCK = """
@@ -73,7 +73,7 @@ def error(folder, n, cloud, consistency="true"):
     rows = store.read_part(folder / "model.h5", 1, 0)
     sub = localise(rows, deck.hexahedra.hourglass, deck.support.stabilisation, "mean")
     tolerance = 1e-5 * STRAIN * SIZE
-    relaxation = Relaxation(replace(deck.solver, tolerance=tolerance), 1, sub, World(), None, None)
+    relaxation = integrator_of(sub, deck.solver.model_copy(update={"tolerance": tolerance}))
     u = relaxed(relaxation)
     u[model.n_fe_nodes :] = np.einsum("na,nai->ni", model.field_shapes, u[model.domains[model.field_domains]])
     free = np.setdiff1d(np.arange(model.n_nodes), surface)
@@ -83,15 +83,12 @@ def error(folder, n, cloud, consistency="true"):
 
 def relaxed(relaxation):
     """Displacements (n_nodes, 3), m, of the static solution."""
-    s = relaxation.state
-    *reactions, update = relaxation.motion
+    s, step = relaxation.state, relaxation.step
     relaxation.begin()
-    for _, term in (*relaxation.forces, *reactions):
-        term(s)
-    while not relaxation.decide(relaxation.look())[1]:
+    apply(s, (*step.forces, *step.work))
+    while not relaxation.decide(relaxation.check())[1]:
         for _ in range(relaxation.between):
-            for _, term in (update, *relaxation.forces, *reactions):
-                term(s)
+            apply(s, step.cycle)
     assert not relaxation.stalled
     return s.u[:, : relaxation.sub.n_nodes].T.copy()
 

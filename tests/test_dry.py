@@ -14,9 +14,9 @@ from mpitled.deck import load_deck
 from mpitled.errors import InputError
 from mpitled.job import prepare, run
 from mpitled.parallel.halo import World
-from mpitled.preview.dry_run import left_out, reasons
 from mpitled.speed.witness import kernel_names
 from mpitled.store import open_result
+from mpitled.terms import TERMS, BorderCells, StartHalo
 
 SCENE = (
     block((20, 20, 20), (8, 7, 7), "{cloud}")
@@ -66,12 +66,12 @@ def test_a_dry_run_tells_the_terms_that_the_run_takes_and_takes_no_step(tmp_path
     with open_result(out) as result:
         assert result.n_frames == int(n)
     assert float(size) * {"kB": 1e3, "MB": 1e6}[unit] == pytest.approx((out / "result.vtkhdf").stat().st_size, rel=0.01)
-    assert ("of domain_forces and domain_survey: support.stabilisation = 0" in told) == (cloud == "core")
-    assert ("gather, add, add_gathered, scatter: one rank" in told) == (ranks == 1)
-    assert ("follow: no node is turned" in told) == (cloud != "all")
+    assert ("stabilisation of support domains: support.stabilisation = 0" in told) == (cloud == "core")
+    assert ("halo: one rank" in told) == (ranks == 1)
+    assert ("rotation of prescribed nodes: no node is rotated" in told) == (cloud != "all")
     if ranks == 1:  # what the result tells of itself
         with open_result(out) as result:
-            spared = left_out(out, result.metadata)
+            spared = result.metadata["left_out"]
         first = lines.index("left out:") + 1
         assert [f"  {what}" for what in spared] == lines[first : first + len(spared)]
         assert lines[first + len(spared)].startswith("-v ")
@@ -97,8 +97,12 @@ def test_a_disc_without_room_for_the_result_is_found_before_the_run(tmp_path, mo
     assert [path.name for path in out.iterdir()] == ["model.h5"]
 
 
-def test_every_kernel_is_either_taken_or_left_out_for_a_reason(tmp_path):
+def test_every_term_is_either_taken_or_left_out_for_a_reason(tmp_path):
     deck = tmp_path / "scene.toml"
     deck.write_text(SCENE.format(cloud="none"))
-    scene = load_deck(deck)
-    assert set(reasons(scene, prepare(scene, tmp_path, World()).sub, 1)) == set(kernel_names())
+    step = prepare(load_deck(deck), tmp_path, World()).integrator.step
+    present = {type(term) for term in step.terms}
+    for cls in TERMS:
+        reasons = [*cls.left_out(step.scene, cls in present)]
+        assert cls in present or reasons or cls in (BorderCells, StartHalo)  # with `InteriorCells` and `FinishHalo`
+        assert all(": " in reason for reason in reasons)

@@ -134,7 +134,7 @@ def test_a_cut_cable_ends_the_job_on_both_hosts(hosts, tmp_path):
     def step() -> int:
         kept = checkpoint.find(out, scene, key)
         assert kept is not None
-        return int(kept.told["step"])
+        return int(kept.contents["step"])
 
     cut_at = step()
     assert cut_at > 0

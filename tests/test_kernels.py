@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 import pytest
+from scenes import step_of
 from scipy.linalg import eigh
 
 from mpitled import kernels
@@ -13,9 +14,9 @@ from mpitled.cells import hexahedra
 from mpitled.laws import Material, NeoHookean, first_piola, strain_energy
 from mpitled.mesh import CORNERS, grid_points, structured_hexahedra
 from mpitled.parallel.subdomain import DOMAIN_NODE_COST, GATHERED_COST, cell_costs, localise
-from mpitled.solver.stability_check import Survey
-from mpitled.solver.step import State, at_rest, compose_forces, compose_march
+from mpitled.solver.stability_check import StabilityCheck
 from mpitled.store import PartRows
+from mpitled.terms import State, apply
 
 BRAIN = Material("brain", NeoHookean(youngs_modulus=3000.0, poissons_ratio=0.49), 1000.0)
 SOFT = Material("soft", NeoHookean(youngs_modulus=10.0, poissons_ratio=0.1), 1000.0)
@@ -126,14 +127,13 @@ def plain(sub_rows, u, stabilisation, rule="mean"):
 
 def at(sub, u):
     """A state with these displacements (n, 3)."""
-    state = at_rest(sub, 1.0, 1e-4)
+    state = State.at_rest(sub, 1.0, 1e-4)
     state.u[:, : len(u)] = u.T
     return state
 
 
 def forces(sub, state):
-    for _, term in compose_forces(sub, None):
-        term(state)
+    step_of(sub).apply_forces(state)
     return state.f[:, : sub.n_nodes].T
 
 
@@ -183,8 +183,8 @@ def test_forces_energies_and_jacobians_are_those_of_the_plain_formulas(scene, st
     # Sums of some 50 products of each cell, and of 8 to 20 cells a node: tens of roundings.
     assert np.abs(found - expected).max() < 1e-13 * np.abs(expected).max()
     assert state.smallest_jacobian == pytest.approx(J.min(), rel=1e-14)
-    seen = Survey(sub)
-    figures = seen.look(state, 1.0)
+    seen = StabilityCheck(sub)
+    figures = seen.evaluate(state, step_of(sub).terms, 1.0)
     assert seen.jacobian[:-1] == pytest.approx(J, rel=2.0**-23)  # as it is kept
     assert figures["strain"] == pytest.approx(strain, rel=1e-10)  # W is a small difference of (J - 1) and ln J
     assert figures["hourglass"] + figures["stabilisation"] == pytest.approx(resisted, rel=1e-12)
@@ -224,7 +224,7 @@ def test_forces_are_the_gradient_of_the_energies(scene):
     u, direction = rng.normal(size=(2, *rows.read("points").shape)) * 1e-4
 
     def energy(step):
-        figures = Survey(sub).look(at(sub, u + step * direction), 1.0)
+        figures = StabilityCheck(sub).evaluate(at(sub, u + step * direction), step_of(sub).terms, 1.0)
         return figures["strain"] + figures["hourglass"] + figures["stabilisation"]
 
     h = 1e-3
@@ -309,15 +309,15 @@ def test_the_bound_holds_the_true_stiffness(scene, stretch):
         step[i] = h
         step = step.reshape(u.shape)
         K[i] = (forces(sub, at(sub, u + step)).ravel() - forces(sub, at(sub, u - step)).ravel()) / (2 * h)
-    survey, state, tensor = Survey(sub), at(sub, u), np.zeros((6, sub.n_nodes))
+    check, terms, state, tensor = StabilityCheck(sub), step_of(sub).terms, at(sub, u), np.zeros((6, sub.n_nodes))
     state.time_step = 2.0
-    survey.look(state, 1.0)
-    scalar = np.repeat(survey.required[0], 3)
-    survey.look(state, 1.0, tensor)
+    check.evaluate(state, terms, 1.0)
+    scalar = np.repeat(check.required[0], 3)
+    check.evaluate(state, terms, 1.0, tensor)
     tensors = np.zeros((sub.n_nodes, 3, sub.n_nodes, 3))
     own = np.arange(sub.n_nodes)
     tensors[own, :, own] = tensor[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3)
-    for mass in (np.diag(scalar), tensors.reshape(n, n) + np.diag(np.repeat(survey.required[0], 3))):
+    for mass in (np.diag(scalar), tensors.reshape(n, n) + np.diag(np.repeat(check.required[0], 3))):
         largest = eigh((K + K.T) / 2, mass, eigvals_only=True)[-1]
         assert 0.1 < largest <= 1.0
 
@@ -329,14 +329,11 @@ def test_a_step_allocates_nothing():
     points, cells, _ = box((60, 12, 12))
     points[:40] += 1e-5
     sub = localise(part(points, cells, *no_domains(), np.zeros(len(cells))), HOURGLASS, 0.1, "mean")
-    terms = (*compose_forces(sub, None), *compose_march(sub))
-    state: State = at_rest(sub, 1.0, 1e-5)
-    for _, term in terms:
-        term(state)
+    terms, state = step_of(sub).terms, State.at_rest(sub, 1.0, 1e-5)
+    apply(state, terms)
     tracemalloc.start()
     for _ in range(1000):
-        for _, term in terms:
-            term(state)
+        apply(state, terms)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 8 * sub.n_nodes  # less than one nodal array of one component
@@ -347,22 +344,21 @@ def test_energy_is_kept_by_the_central_difference():
     points, cells, _ = box((6, 5, 4))
     rows = part(points, cells, *no_domains(), np.zeros(len(cells)))
     sub = localise(rows, HOURGLASS, 0.0, "mean")
-    terms = (*compose_forces(sub, None), *compose_march(sub))
+    step = step_of(sub)
 
     def swing(time_step):
-        state = at_rest(sub, 1e6, time_step)
-        state.mobility[:] = time_step**2 / 1e-5
+        state = State.at_rest(sub, 1e6, time_step)
+        state.dt2_over_m[:] = time_step**2 / 1e-5
         state.u[:, : sub.n_nodes] = (points * [0.05, -0.02, -0.02]).T
         state.u_prev[:] = state.u
-        survey, owned, none = Survey(sub), np.ones(sub.n_nodes, bool), np.zeros(0, np.uint32)
+        check, owned, none = StabilityCheck(sub), np.ones(sub.n_nodes, bool), np.zeros(0, np.uint32)
         energies = []
         for _ in range(round(4e-2 / time_step)):
-            for _, term in terms[:-1]:
-                term(state)
-            figures = survey.look(state, 1.0)
-            kinetic = kernels.kinetic_energy(state.u, state.u_prev, state.f, state.mobility, owned, none)
+            step.apply_forces(state)
+            figures = check.evaluate(state, step.terms, 1.0)
+            kinetic = kernels.kinetic_energy(state.u, state.u_prev, state.f, state.dt2_over_m, owned, none)
             energies.append(figures["strain"] + figures["hourglass"] + kinetic)
-            terms[-1][1](state)
+            apply(state, step.update)
         energies = np.array(energies)
         return np.abs(energies - energies[1]).max() / energies[1]
 
@@ -380,8 +376,8 @@ def test_speed():
         "domains": sorted_cloud(100_000),
     }.items():
         sub = localise(rows, HOURGLASS, 0.1, "mean")
-        terms = dict((*compose_forces(sub, None), *compose_march(sub)))
-        state = at_rest(sub, 1.0, 1e-9)
+        terms = {term.name: term.apply for term in step_of(sub).terms}
+        state = State.at_rest(sub, 1.0, 1e-9)
         seconds = {term: [] for term in terms}
         for _ in range(15):
             for term, act in terms.items():

@@ -373,7 +373,6 @@ def test_a_centre_in_metres_is_told_in_millimetres(tmp_path):
         ({"size": 0.004e-3}, "enlarge it"),
         ({"size": 0.2}, "make it smaller"),
         ({"size": 0.03}, "make it smaller"),
-        ({"tissue": ()}, "labels.tissue names no label"),
         ({"right_ventricle": (41,)}, "given twice"),
         ({"left_ventricle": (44,)}, r"in it; name one of 5, 7, 41, or none: labels.left_ventricle = \[\]$"),
         ({"tissue": (44,)}, "in it; name one of 5, 7, 41$"),
@@ -453,7 +452,7 @@ growth = 0.4
     path = tmp_path / "brain.toml"
     path.write_text(text.replace("[]", "[5]"))
     line = complaint(mpitled("check", path, status=2))
-    assert line.endswith("give it to labels.left_ventricle and leave labels.right_ventricle = []")
+    assert line.endswith("name a label once; one label of both ventricles: labels.right_ventricle = []")
     path.write_text(text)
     assert "mm from the left ventricle" in mpitled("check", path).stdout
     mpitled("run", path, "--out", tmp_path / "out")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 from conftest import ROOT
@@ -64,7 +62,7 @@ def test_volumes_converge_at_second_order(mesher, sizes, exact):
 def test_a_tumour_far_outside_is_said_to_be_outside(mesher, centre):
     """50 mm from the body: no radius of the cloud is the remedy."""
     with pytest.raises(InputError, match=r"^tumour.centre = .* outside the body, 50(\.\d)? mm from it; move it inside"):
-        mesher(tumour=dataclasses.replace(TUMOUR, centre=centre), cloud="core")
+        mesher(tumour=TUMOUR.model_copy(update={"centre": centre}), cloud="core")
 
 
 def test_cylinder_has_its_nodes_on_its_surface():
@@ -158,7 +156,7 @@ def test_block_is_fitted_to_a_sphere(where):
     assert 0 < errors[1] < errors[0] < 0.1
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
     with pytest.raises(InputError, match=r"block.fitted: the sphere cyst .* does not lie in the block"):
-        block_mesh(block, CLOUD, None, dataclasses.replace(sphere, radius=0.04))
+        block_mesh(block, CLOUD, None, sphere.model_copy(update={"radius": 0.04}))
 
 
 def test_sphere_of_cells(tmp_path):

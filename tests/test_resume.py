@@ -43,7 +43,7 @@ OF_THE_MACHINE = {"seconds", "term_seconds", "cell_updates_per_second", "halo_sh
 
 def run(deck: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, stop_at: int = 0, resume: bool = False) -> Any:
     """The report; or stop at a look, as a signal does, and give the number of looks that there were."""
-    looks, look = 0, Run._look
+    looks, look = 0, Run._check
 
     def counted(this: Run) -> None:
         nonlocal looks
@@ -52,7 +52,7 @@ def run(deck: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, stop_at: int 
         look(this)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Run, "_look", counted)
+        patch.setattr(Run, "_check", counted)
         try:
             report = job.run(load_deck(deck), folder, World(), quiet=True, resume=resume)
         except InterruptedRun:

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scenes import integrator_of
 
 from mpitled import job, store
 from mpitled.deck import load_deck, model_key
 from mpitled.model import build as model_build
 from mpitled.parallel.halo import World
 from mpitled.parallel.subdomain import localise
-from mpitled.solver.central_difference import March
-from mpitled.solver.dynamic_relaxation import Relaxation
+from mpitled.terms import apply
 
 TISSUE = """
 [material.tissue]
@@ -116,8 +116,7 @@ def grows(method, mobility, ratio):
 
     def force():
         s.f[:] = 0
-        for _, term in method.forces:
-            term(s)
+        method.step.apply_forces(s)
         return s.f[:, :n].copy()
 
     s.u[:, :n] = start
@@ -156,20 +155,16 @@ def longest_stable(method, mobility):
 
 
 def test_auto_is_never_above_the_limit_and_mostly_near_it(tmp_path):
-    world, shares = World(), {}
+    shares = {}
     for name, text, share, stretch in scenes():
         deck, sub, figures = subdomain(tmp_path, text, share)
         place = (sub.rows.read("points") @ (STRETCHES[stretch] - np.eye(3)).T).T
-        for kind in ("dynamic", "quasi-static", "relaxation"):
-            solver = replace(deck.solver, method=kind)
-            if kind == "relaxation":
-                method = Relaxation(solver, 1, sub, world, None, None)
-            else:
-                method = March(solver, 1, sub, world, None, None, figures)
+        for kind in ("dynamic", "quasi-static", "dynamic-relaxation"):
+            method = integrator_of(sub, deck.solver.model_copy(update={"method": kind}), figures)
             method.state.u[:, : sub.n_nodes] = place
             method.begin()
-            method.look()
-            shares[f"{name}, {kind}"] = 1 / longest_stable(method, method.state.mobility)
+            method.check()
+            shares[f"{name}, {kind}"] = 1 / longest_stable(method, method.state.dt2_over_m)
     for name, value in shares.items():
         print(f"{value:.3f} {name}")
     values = np.array(list(shares.values()))
@@ -185,25 +180,21 @@ def test_the_limit_is_followed_while_a_tumour_grows(tmp_path, cloud, kind):
     text = ELLIPSOID.format(cloud=cloud) + TISSUE.format(nu=0.49, fixed="surface") + TUMOUR
     deck, sub, figures = subdomain(tmp_path, text.replace("150.0", "600.0"), 0)
     # Slow enough that no cell is crushed on the way: that is a state which no step makes stable.
-    solver, world = replace(deck.solver, method=kind, load_time=0.5, load_steps=300), World()
-    if kind == "quasi-static":
-        method = March(solver, 1, sub, world, None, None, figures)
-    else:
-        method = Relaxation(solver, 1, sub, world, None, None)
+    changes = {"method": kind, "load_time": 0.5, "load_steps": 300}
+    method = integrator_of(sub, deck.solver.model_copy(update=changes), figures)
+        sub, deck.solver.model_copy(update={"method": kind, "load_time": 0.5, "load_steps": 300}), figures
+    )
     method.begin()
-    (*reactions, update), last, limits = method.motion, False, []
-    for _, term in (*method.forces, *reactions):
-        term(method.state)
+    step, last, limits = method.step, False, []
+    apply(method.state, (*step.forces, *step.work))
     while not last and method.state.share < 1:
-        figures = method.look()
+        figures = method.check()
         if method.state.share > 0.2 * len(limits):
-            limits.append(1 / longest_stable(method, method.state.mobility))
-            for _, term in method.forces:
-                term(method.state)
+            limits.append(1 / longest_stable(method, method.state.dt2_over_m))
+            step.apply_forces(method.state)
         _, last = method.decide(figures)
         for _ in range(method.between):
-            for _, term in (update, *method.forces, *reactions):
-                term(method.state)
+            apply(method.state, step.cycle)
     print(limits)
     assert len(limits) >= 5
     assert max(limits) < 1
@@ -219,27 +210,24 @@ def test_a_stiffer_mode_that_comes_up_elsewhere_is_found(tmp_path):
     assert report["min_jacobian"] > 0.8
 
 
-@pytest.mark.parametrize("kind", ["quasi-static", "dynamic", "relaxation"])
+@pytest.mark.parametrize("kind", ["quasi-static", "dynamic", "dynamic-relaxation"])
 def test_the_iteration_leaves_the_forces_of_the_displacements(tmp_path, kind):
     """To the bit: a run that is continued begins with forces made anew."""
     deck, sub, figures = subdomain(
         tmp_path, BLOCK.format(size=[30.0] * 3, cloud="core") + TISSUE.format(nu=0.49, fixed="z0"), 0.1
     )
-    if kind == "relaxation":
-        method = Relaxation(replace(deck.solver, method=kind), 1, sub, World(), None, None)
-    else:
-        method = March(replace(deck.solver, method=kind), 1, sub, World(), None, None, figures)
+    method = integrator_of(sub, deck.solver.model_copy(update={"method": kind}), figures)
     method.begin()
     s = method.state
-    s.place(np.random.default_rng(0).normal(scale=1e-14, size=(3, sub.n_nodes)))  # m: smaller than what is tried
-    for _, term in method.forces:
-        term(s)
+    s.set_displacement(
+        np.random.default_rng(0).normal(scale=1e-14, size=(3, sub.n_nodes))
+    )  # m: smaller than what is tried
+    method.step.apply_forces(s)
     before = s.u.copy()
-    method.sharpness.next = 0
-    method.decide(method.look())
+    method.spectral_radius.next_step = 0
+    method.decide(method.check())
     assert not np.array_equal(s.u, before)  # it was tried in place
     left = s.f.copy()
     s.f[:] = 0
-    for _, term in method.forces:
-        term(s)
+    method.step.apply_forces(s)
     assert np.array_equal(s.f, left)

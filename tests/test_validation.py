@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 from conftest import ROOT, mpitled
+from scenes import step_of
 from scipy.linalg import eigh
 from scipy.optimize import brentq
 from test_compare import CYLINDER, DATA, SLOPE, synthetic
@@ -18,7 +19,7 @@ from mpitled.laws import first_piola
 from mpitled.model import build as model_build
 from mpitled.parallel.subdomain import localise
 from mpitled.results import charts, compare, field
-from mpitled.solver.step import at_rest, compose_forces
+from mpitled.terms import State
 
 CUBE = ROOT / "jobs" / "validation" / "cube.toml"
 #: What the deck of the cube has other than the program's defaults.
@@ -90,14 +91,13 @@ def slowest(folder, stretch, *keys):
     )
     material = model.materials[0]
     width = brentq(lambda t: first_piola(material.law, np.diag([t, t, stretch]))[0, 0], 1, stretch**-0.5 + 0.1)
-    state, terms = at_rest(sub, 1.0, 1e-4), compose_forces(sub, None)
+    state, step = State.at_rest(sub, 1.0, 1e-4), step_of(sub)
     n, free = sub.n_nodes, np.flatnonzero(sub.free().T)
     state.u[:, :n] = (model.points * (np.array([width, width, stretch]) - 1)).T
 
     def forces():
         state.f[:] = 0
-        for _, term in terms:
-            term(state)
+        step.apply_forces(state)
         return state.f[:, :n].T.ravel()[free]
 
     scale = np.abs(np.diff(model.points, axis=0)).max()

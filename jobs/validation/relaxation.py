@@ -26,8 +26,8 @@ from mpitled.batch import launch
 from mpitled.deck import load_deck
 from mpitled.preview import forecast
 from mpitled.results import field
-from mpitled.solver.dynamic_relaxation import Relaxation
-from mpitled.solver.step import take
+from mpitled.solver.dynamic_relaxation import DynamicRelaxation
+from mpitled.terms import apply
 
 HERE = Path(__file__).parent
 STUDIES = HERE.parent / "studies"
@@ -85,19 +85,17 @@ def reached(out: Path, deck: str, overrides: Sequence[str]) -> int:
     solved(out / "rest", deck, (*overrides, RELAXING, f"solver.tolerance={AT_REST}"))
     rest = field.open_field(out / "rest").parameters.T
     keys = (*ALWAYS, *overrides, RELAXING, f"solver.tolerance={NEAR}")
-    _, relaxation = forecast.first_rank(load_deck(HERE / f"{deck}.toml", keys), out / "rest" / "model.h5")
-    assert isinstance(relaxation, Relaxation)
+    relaxation = forecast.first_rank(load_deck(HERE / f"{deck}.toml", keys), out / "rest" / "model.h5")
+    assert isinstance(relaxation, DynamicRelaxation)
     s, near, ended = relaxation.state, 0, False
-    *reactions, update = relaxation.motion
     relaxation.begin()
-    forces = (*relaxation.forces, *reactions)
-    take(s, forces)
+    apply(s, (*relaxation.step.forces, *relaxation.step.work))
     while not ended:
         distance = 1e3 * np.linalg.norm(s.u[:, : rest.shape[1]] - rest, axis=0).max()
         near = (near or s.step) if s.share >= 1 and distance <= NEAR else 0
-        _, ended = relaxation.decide(relaxation.look())
+        _, ended = relaxation.decide(relaxation.check())
         for _ in range(0 if ended else relaxation.between):
-            take(s, (update, *forces))
+            apply(s, relaxation.step.cycle)
     return near
 
 

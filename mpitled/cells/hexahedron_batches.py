@@ -135,7 +135,10 @@ def _in_row(nodes: NDArray[np.uint32], width: int) -> NDArray[np.bool_]:
 
 @inline
 def _corner_values(uc, nodes, w, in_row):  # type: ignore[no-untyped-def]
-    """A component at the corners of some lanes of a batch. in_row: None, or each corner's nodes follow each other."""
+    """A component at the corners of the lanes of a batch from w on.
+
+    in_row: None, or the nodes of each corner are consecutive.
+    """
     if in_row is not None:
         return (
             load(uc, U(nodes[0, w])), load(uc, U(nodes[1, w])), load(uc, U(nodes[2, w])), load(uc, U(nodes[3, w])),
@@ -149,7 +152,7 @@ def _corner_values(uc, nodes, w, in_row):  # type: ignore[no-untyped-def]
 
 @inline
 def _add_row(fc, node, near, far):  # type: ignore[no-untyped-def]
-    """Add forces to the nodes of a row: the near ones of its cells, and the far ones, each the near one of the next."""
+    """Add forces to the nodes of a row of cells; the far node of a cell is the near node of the next cell."""
     first = U(node)
     none = broadcast(fc.dtype.type(0), fc)
     store(fc, first, load(fc, first) + (near + shift(none, far)))
@@ -158,7 +161,7 @@ def _add_row(fc, node, near, far):  # type: ignore[no-untyped-def]
 
 @inline
 def _add_corner_values(fc, nodes, w, in_row, c):  # type: ignore[no-untyped-def]
-    """The transpose of `_corner_values`: add c to them."""
+    """The transpose of `_corner_values`: add c at the corners."""
     if in_row is not None:
         _add_row(fc, nodes[0, w], c[0], c[1])
         _add_row(fc, nodes[3, w], c[3], c[2])
@@ -229,7 +232,7 @@ def _add_hexahedron_forces(fc, nodes, g, w, in_row, px, py, pz, modes, k):  # ty
 
 @inline_template
 def _add_forces(u, f, nodes, g, coefficient, w, in_row):  # type: ignore[no-untyped-def]
-    """Add the forces of some lanes of a batch; their J."""
+    """Add the forces of the lanes of a batch from w on; returns their J."""
     mx = _hexahedron_modes(u[0], nodes, g, w, in_row)
     my = _hexahedron_modes(u[1], nodes, g, w, in_row)
     mz = _hexahedron_modes(u[2], nodes, g, w, in_row)
@@ -243,7 +246,7 @@ def _add_forces(u, f, nodes, g, coefficient, w, in_row):  # type: ignore[no-unty
 
 
 def forces_template(u, f, nodes, in_row, geometry, coefficient):  # type: ignore[no-untyped-def]
-    """Add the nodal forces of hexahedra of any shape to f; the smallest J among them.
+    """Add the nodal forces of hexahedra of any shape to f; returns the smallest J of these cells.
 
     nodes (n_batches, 8, lanes) uint32. in_row (n_batches, vectors in a batch): whether the nodes of each corner follow
     each other in the vector, and those of corners 1, 2, 5, 6 those of 0, 3, 4, 7: then nothing is gathered. geometry
@@ -258,7 +261,7 @@ def forces_template(u, f, nodes, in_row, geometry, coefficient):  # type: ignore
         g = geometry[batch]
         prefetch(geometry[min(batch + U(1), last_batch)])
         for w in range(U(0), _BATCH, width(u[0])):
-            # In either way straight on: vectors stay in registers.
+            # Two branches without a common part: the vectors stay in registers.
             if in_row[batch, w // width(u[0])]:
                 J = _add_forces(u, f, at, g, coefficient[batch], w, True)
             else:

@@ -105,9 +105,9 @@ def _add_products(sums, number, x, y, z):  # type: ignore[no-untyped-def]
 
 @inline
 def _affine(total, sums, inverse, w, share):  # type: ignore[no-untyped-def]
-    """Mean and the three slopes of the affine part of one component: (X^T X)^-1 X^T u.
+    """Mean and three slopes of the affine part of one component: (X^T X)^-1 X^T u.
 
-    total: of u over the nodes; sums: of u X_a, with X from their mean; inverse (6, lanes): of X^T X.
+    total: sum of u over the nodes; sums: sums of u X_a, with X relative to the mean; inverse (6, lanes): of X^T X.
     """
     x, y, z = sums
     return (
@@ -119,17 +119,20 @@ def _affine(total, sums, inverse, w, share):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _remainder(number, affine, x, y, z):  # type: ignore[no-untyped-def]
-    """A component of a node's displacement less its affine part: Q u. Q is symmetric: momentum and moment are kept."""
+def _non_affine(number, affine, x, y, z):  # type: ignore[no-untyped-def]
+    """A component of a node's displacement minus its affine part: Q u.
+
+    Q is symmetric, which conserves momentum and angular momentum.
+    """
     return (number - affine[0]) - (affine[1] * x + affine[2] * y + affine[3] * z)
 
 
 @inline
 def _domain_modes(u, nodes, gradient, position, inverse, w, ue):  # type: ignore[no-untyped-def]
-    """grad u (a tuple of 9), and for each component the affine part of u, by the nodes' unweighted linear projector.
+    """grad u (a tuple of 9) of the lanes of a batch from w on, and the affine part of each component of u.
 
-    Of one batch's lanes from w on; fills ue (3 n, lanes) with the nodes' displacements. Without position the affine
-    parts are nothing.
+    The affine part is that of the unweighted linear projector of the nodes; it is 0 without `position`. Fills
+    ue (3 n, lanes) with the nodal displacements.
     """
     n = U(nodes.shape[0])
     share = u.dtype.type(1) / u.dtype.type(nodes.shape[0])
@@ -177,7 +180,7 @@ def _domain_modes(u, nodes, gradient, position, inverse, w, ue):  # type: ignore
 
 
 def forces_template(u, f, nodes, gradient, position, inverse, coefficient):  # type: ignore[no-untyped-def]
-    """Add the nodal forces of support domains to f; the smallest J among them.
+    """Add the nodal forces of support domains to f; returns the smallest J of these cells.
 
     nodes (n_batches, n, lanes) uint32; gradient and position (n_batches, 3 n, lanes), 1/m and m; inverse (n_batches, 6,
     lanes), 1/m^2; coefficient (n_batches, n + 1, lanes): the law's n coefficients times V (J), then the stabilisation
@@ -209,9 +212,9 @@ def forces_template(u, f, nodes, gradient, position, inverse, coefficient):  # t
                     x = load(X[i], w)
                     y = load(X[i + U(1)], w)
                     z = load(X[i + U(2)], w)
-                    fx = fx + k * _remainder(load(ue[i], U(0)), ax, x, y, z)
-                    fy = fy + k * _remainder(load(ue[i + U(1)], U(0)), ay, x, y, z)
-                    fz = fz + k * _remainder(load(ue[i + U(2)], U(0)), az, x, y, z)
+                    fx = fx + k * _non_affine(load(ue[i], U(0)), ax, x, y, z)
+                    fy = fy + k * _non_affine(load(ue[i + U(1)], U(0)), ay, x, y, z)
+                    fz = fz + k * _non_affine(load(ue[i + U(2)], U(0)), az, x, y, z)
                 scatter(f[0], at[a], w, fx)
                 scatter(f[1], at[a], w, fy)
                 scatter(f[2], at[a], w, fz)
@@ -219,19 +222,19 @@ def forces_template(u, f, nodes, gradient, position, inverse, coefficient):  # t
 
 
 @inline
-def _image(k, x, y, z):  # type: ignore[no-untyped-def]
-    """K B_a, the direction in which a node's material stiffness acts."""
+def _cofactor_times(k, x, y, z):  # type: ignore[no-untyped-def]
+    """K B_a: the direction of the material stiffness at a node."""
     return k[0] * x + k[1] * y + k[2] * z, k[3] * x + k[4] * y + k[5] * z, k[6] * x + k[7] * y + k[8] * z
 
 
 @inline
-def _length(v):  # type: ignore[no-untyped-def]
+def _norm(v):  # type: ignore[no-untyped-def]
     return np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
 
 
 @inline_template
 def _add_tensors(grad, nodes, gradient, coefficient, stiffness, w, tensor, factor, value):  # type: ignore[no-untyped-def]
-    """Add the bounds of some lanes' stiffness at their nodes, times factor, to tensor (6, n_nodes).
+    """Add the stiffness bounds of the lanes from w on, times factor, to the tensors (6, n_nodes) of their nodes.
 
     value (6, lanes): scratch.
     """
@@ -239,25 +242,25 @@ def _add_tensors(grad, nodes, gradient, coefficient, stiffness, w, tensor, facto
     tiny = value.dtype.type(1e-30)
     F, K, J = deformation(grad)
     a, b = law_tangent_bound(F, K, J, load_each(coefficient, N_COEFFICIENTS, w))
-    sum_g = broadcast(value.dtype.type(0), value[0])
-    sum_b = sum_g
+    sum_material = broadcast(value.dtype.type(0), value[0])
+    sum_isotropic = sum_material
     for m in range(n):
         B = (load(gradient[U(3) * m], w), load(gradient[U(3) * m + U(1)], w), load(gradient[U(3) * m + U(2)], w))
-        sum_g = sum_g + _length(_image(K, B[0], B[1], B[2]))
-        sum_b = sum_b + _length(B)
-    along = factor * a * sum_g
-    alike = factor * b * sum_b
+        sum_material = sum_material + _norm(_cofactor_times(K, B[0], B[1], B[2]))
+        sum_isotropic = sum_isotropic + _norm(B)
+    material = factor * a * sum_material
+    isotropic = factor * b * sum_isotropic
     for m in range(n):
         B = (load(gradient[U(3) * m], w), load(gradient[U(3) * m + U(1)], w), load(gradient[U(3) * m + U(2)], w))
-        G = _image(K, B[0], B[1], B[2])
-        s = along / (_length(G) + tiny)
-        same = alike * _length(B) + factor * load(stiffness, w)
-        store(value[0], U(0), s * G[0] * G[0] + same)
+        G = _cofactor_times(K, B[0], B[1], B[2])
+        s = material / (_norm(G) + tiny)
+        diagonal = isotropic * _norm(B) + factor * load(stiffness, w)
+        store(value[0], U(0), s * G[0] * G[0] + diagonal)
         store(value[1], U(0), s * G[0] * G[1])
         store(value[2], U(0), s * G[0] * G[2])
-        store(value[3], U(0), s * G[1] * G[1] + same)
+        store(value[3], U(0), s * G[1] * G[1] + diagonal)
         store(value[4], U(0), s * G[1] * G[2])
-        store(value[5], U(0), s * G[2] * G[2] + same)
+        store(value[5], U(0), s * G[2] * G[2] + diagonal)
         for lane in range(width(value[0])):
             for j in range(6):
                 tensor[j, nodes[m, w + lane]] += value[j, lane]
@@ -280,10 +283,10 @@ def check_template(  # type: ignore[no-untyped-def]
 ):
     """As `voxel_runs.check_template`, of support domains: strain energy and stabilisation energy.
 
-    Where tensor (6, n_nodes) is given, it takes what the domains ask, as tensors, in place of required. A domain's
-    material stiffness is that of one direction g_a = K B_a at each node: c (sum_a g_a . u_a)^2. By Cauchy's inequality
-    that is at most c (sum_b |g_b|) sum_a (g_a . u_a)^2 / |g_a|; the rest is bounded alike with |B_a|. Next to a grown
-    tumour the first is large across the thin layers and small along them.
+    Where tensor (6, n_nodes) is given, it receives mass tensors, and required receives nothing. The material stiffness
+    of a domain acts in one direction g_a = K B_a at each node: c (sum_a g_a . u_a)^2. By Cauchy's inequality it is at
+    most c (sum_b |g_b|) sum_a (g_a . u_a)^2 / |g_a|. The remaining stiffness is bounded likewise with |B_a|. Next
+    to a grown tumour the first bound is large across the thin layers and small along them.
     """
     n = U(nodes.shape[1])
     factor = u.dtype.type(factor)
@@ -307,9 +310,9 @@ def check_template(  # type: ignore[no-untyped-def]
                     x = load(X[i], w)
                     y = load(X[i + U(1)], w)
                     z = load(X[i + U(2)], w)
-                    rx = _remainder(load(ue[i], U(0)), ax, x, y, z)
-                    ry = _remainder(load(ue[i + U(1)], U(0)), ay, x, y, z)
-                    rz = _remainder(load(ue[i + U(2)], U(0)), az, x, y, z)
+                    rx = _non_affine(load(ue[i], U(0)), ax, x, y, z)
+                    ry = _non_affine(load(ue[i + U(1)], U(0)), ay, x, y, z)
+                    rz = _non_affine(load(ue[i + U(2)], U(0)), az, x, y, z)
                     squares = squares + (rx * rx + ry * ry + rz * rz)
             store(value[3], w, squares)
             if tensor is not None:

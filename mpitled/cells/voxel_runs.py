@@ -191,7 +191,7 @@ def find_runs(points: NDArray[np.float64], cells: NDArray[np.integer], material:
 
 @inline
 def _box_modes(uc, i0, i1, i2, i3):  # type: ignore[no-untyped-def]
-    """`corner_modes` of consecutive boxes that have their corners on four grid lines, from these nodes on."""
+    """`corner_modes` of consecutive boxes with corners on four grid lines that begin at these nodes."""
     one = U(1)
     return corner_modes(
         load(uc, i0), load(uc, i0 + one), load(uc, i1 + one), load(uc, i1),
@@ -201,15 +201,15 @@ def _box_modes(uc, i0, i1, i2, i3):  # type: ignore[no-untyped-def]
 
 @inline
 def _add_line(fc, node, near, far, before):  # type: ignore[no-untyped-def]
-    """Add forces to the nodes of a grid line: each is the near node of one box and the far one of the box before."""
+    """Add forces to the nodes of a grid line; each is the near node of one box and the far node of the previous box."""
     store(fc, node, load(fc, node) + (near + shift(before, far)))
 
 
 @inline
 def _add_box_forces(fc, i0, i1, i2, i3, r, s, t, modes, k, before):  # type: ignore[no-untyped-def]
-    """Add the forces of boxes in one direction; those at their far nodes, which the next boxes have to know.
+    """Add the forces of boxes in one direction; returns the forces at their far nodes, for the next boxes.
 
-    r, s, t: the stress's part; modes: of u; before: what this made for the boxes before.
+    r, s, t: the part of the stress; modes: of u; before: what this function returned for the previous boxes.
     """
     c = corner_values(r, s, t, k * modes[3], k * modes[4], k * modes[5], k * modes[6])
     _add_line(fc, i0, c[0], c[1], before[0])
@@ -230,16 +230,16 @@ def _box_gradient(mx, my, mz, g0, g1, g2):  # type: ignore[no-untyped-def]
 
 
 def forces_template(u, f, line, length, along, scale, coefficient):  # type: ignore[no-untyped-def]
-    """Add the nodal forces of runs of equal boxes to f; the smallest J among them.
+    """Add the nodal forces of runs of equal boxes to f; returns the smallest J of these cells.
 
-    line (4, n_runs) and length (n_runs,), uint64: a run's cell w lies between the nodes line + w and line + w + 1 of
-    four grid lines along the axis `along` (n_runs,). Axes are counted from that one, in turn: so are the corners, of
-    which 0, 3, 4 and 7 come first on the lines. scale (3, n_runs), 1/m: the gradient of a sign vector, 1 / (4 edge).
+    line (4, n_runs) and length (n_runs,), uint64: cell w of a run lies between the nodes line + w and line + w + 1 of
+    four grid lines along the axis `along` (n_runs,). Axes and corners are numbered cyclically from it; corners 0,
+    3, 4 and 7 are the near ends on the lines. scale (3, n_runs), 1/m: the gradient of a sign vector, 1 / (4 edge).
     coefficient (n + 1, n_runs): the law's n coefficients times V, J, and the hourglass stiffness k of eq. 4.22, N/m
     (R (lambda + 2 mu) V (B:B) / 8).
 
-    On a box gamma^T u = H^T u, for x^T H = 0 (eq. 4.20). The last vector of a run has lanes without a cell, whose nodes
-    are those that come behind: they have no stiffness, and add nothing there.
+    On a box x^T H = 0, and so gamma^T u = H^T u (eq. 4.20). The last vector of a run has lanes without a cell. These
+    lanes read the nodes behind the run; they have no stiffness and add no force.
     """
     zeros = broadcast(u.dtype.type(0), u[0])
     ones = broadcast(u.dtype.type(1), u[0])

@@ -1,4 +1,4 @@
-"""The compiled kernels of a step: nodal forces, the survey of the cells, the central-difference update, packing.
+"""The compiled kernels of nodes, and what the kernels of cells are made from: vectors, tensors and templates.
 
 Nodal arrays are component-major, (3, n_nodes + PADDING). Every index is unsigned, because numba's test for negative
 indices stops the vectoriser. Forces are *internal* forces f; the equation of motion is m a = -f at free nodes. All are
@@ -14,26 +14,26 @@ with cached_by_source():
         add,
         add_gathered,
         change_step,
-        follow,
         gather,
+        hash_random,
         invert_masses,
-        keep_masses,
         kinetic_energy,
+        limit_mass_decrease,
         perturb,
+        power_iteration,
         raise_mass,
-        react,
+        reaction_work,
         relax,
-        respond,
+        relaxation_norms,
+        rotate_prescribed,
         scatter,
-        scramble,
         update,
-        watch_relaxation,
     )  # fmt: skip
 
 PADDING = BATCH_LANES  # the last vector of a run reads beyond the run's nodes, and adds nothing there
 
 __all__ = [
-    "BATCH_LANES", "PADDING", "add", "add_gathered", "change_step", "follow",
-    "gather", "invert_masses", "keep_masses", "kinetic_energy", "perturb",
-    "raise_mass", "react", "relax", "respond", "scatter", "scramble", "update", "watch_relaxation",
+    "BATCH_LANES", "PADDING", "add", "add_gathered", "change_step", "gather", "hash_random", "invert_masses",
+    "kinetic_energy", "limit_mass_decrease", "perturb", "power_iteration", "raise_mass", "reaction_work", "relax",
+    "relaxation_norms", "rotate_prescribed", "scatter", "update",
 ]  # fmt: skip

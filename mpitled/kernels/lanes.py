@@ -1,8 +1,8 @@
-"""Vectors for the kernels: numbers that fill a register of 512 bits, one of each cell that is worked on at once.
+"""Explicit vectors for the kernels: a vector fills a register of 512 bits with one number of each of several cells.
 
-Numba's vectoriser keeps what lies between two loops in memory, and gathers one number at a time. Here kernels say
-themselves what is a vector. A processor with narrower registers takes several for one vector. Everything works in plain
-Python as well, on arrays of numpy, which is how operations are counted. Indices are unsigned (numba.uint64).
+Numba's vectoriser stores intermediate values between loops to memory and gathers one number at a time. The kernels
+therefore use explicit vectors. On a processor with narrower registers a vector takes several registers. All functions
+also work in plain Python on numpy arrays, which is used to count operations. Indices are unsigned (numba.uint64).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numba.extending import lower_builtin, register_model
 BITS = 512
 #: Lanes of one batch of gathered cells: of a vector of the narrowest numbers.
 BATCH = BITS // 32
-# Fused multiply-adds and free association, but NaN and infinity stay what they are: the watch needs them.
+# Fused multiply-adds and reassociation are allowed. NaN and infinity are kept, because the monitor detects them.
 FAST = {"contract", "nsz", "arcp", "reassoc"}
 _FLAGS = tuple(sorted(FAST))
 
@@ -43,21 +43,21 @@ class _Model(models.PrimitiveModel):
         super().__init__(manager, lanes, ir.VectorType(value, lanes.width))
 
 
-# ---------------------------------------------------------------- what kernels call, in plain Python
+# ---------------------------------------------------------------- the functions in plain Python
 
 
 def width(row):  # type: ignore[no-untyped-def]
-    """Lanes of a vector of the numbers in this array."""
+    """Number of lanes of a vector of the numbers in this array."""
     return np.uint64(8 if row.dtype == object else BITS // 8 // row.dtype.itemsize)
 
 
 def broadcast(number, row):  # type: ignore[no-untyped-def]
-    """The same number, of the type of those in `row`, in all lanes."""
+    """The same number in all lanes, with the type of the numbers in `row`."""
     return np.full(width(row), number, row.dtype)
 
 
 def load(row, first):  # type: ignore[no-untyped-def]
-    """row[first], row[first + 1], ...: so many numbers that they fill a vector. No bounds are looked at."""
+    """The vector row[first], row[first + 1], ... without a check of the bounds."""
     return row[first : first + width(row)].copy()
 
 
@@ -67,27 +67,27 @@ def store(row, first, lanes):  # type: ignore[no-untyped-def]
 
 
 def gather(row, nodes, first):  # type: ignore[no-untyped-def]
-    """row[nodes[first]], row[nodes[first + 1]], ...; nodes uint32, below 2^31."""
+    """The vector row[nodes[first]], row[nodes[first + 1]], ...; nodes are uint32 below 2^31."""
     return row[nodes[first : first + width(row)]]
 
 
 def scatter(row, nodes, first, lanes):  # type: ignore[no-untyped-def]
-    """row[nodes[first]] += the first lane, and so on, in this order; nodes may be the same."""
+    """row[nodes[first]] += the first lane, and so on in this order; nodes may repeat."""
     for node, number in zip(nodes[first : first + width(row)], lanes, strict=True):
         row[node] += number
 
 
 def prefetch(batch):  # type: ignore[no-untyped-def]
-    """Ask for an array of two dimensions before it is needed."""
+    """Prefetch an array of two dimensions into the cache."""
 
 
 def select_first(n, lanes, others):  # type: ignore[no-untyped-def]
-    """The first n of the lanes, and the others behind them."""
+    """`lanes` in the first n lanes, and `others` in the remaining lanes."""
     return np.where(np.arange(len(lanes)) < n, lanes, others)
 
 
 def shift(before, lanes):  # type: ignore[no-untyped-def]
-    """The last lane of the vector before, and all of this but the last."""
+    """The last lane of `before`, followed by all lanes of `lanes` but its last."""
     return np.concatenate([before[-1:], lanes[:-1]])
 
 
@@ -97,7 +97,7 @@ def last(lanes):  # type: ignore[no-untyped-def]
 
 
 def minimum(a, b):  # type: ignore[no-untyped-def]
-    """The minimum of two numbers in each lane; the first where either is no number."""
+    """The minimum of two numbers in each lane; the first number if one of them is NaN."""
     return np.where(b < a, b, a)
 
 
@@ -120,14 +120,14 @@ def broadcast_each(columns, count, column, n, row):  # type: ignore[no-untyped-d
     return tuple(select_first(n, broadcast(columns[i, column], row), zeros) for i in range(count))
 
 
-# ---------------------------------------------------------------- and what they become
+# ---------------------------------------------------------------- the functions in LLVM
 
 _Lower = Callable[[Any, Any, Any, Any], Any]
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
 
 
 def _typed(function: Any, result: Callable[..., types.Type | None]) -> None:
-    """Tell numba the type of a call from those of its arguments; None if it is none of ours."""
+    """Register the result type of a function by its argument types; None where the function does not apply."""
 
     class Template(AbstractTemplate):
         def generic(self, arguments: Any, keywords: Any) -> Any:
@@ -176,7 +176,7 @@ for _function, _instruction in (
 
 
 def _of(row: types.Type) -> Lanes | None:
-    """The vectors that an array without gaps is made of."""
+    """The vector type of a contiguous array."""
     if isinstance(row, types.Array) and isinstance(row.dtype, types.Float) and row.layout == "C":
         return Lanes(row.dtype)
     return None
@@ -199,7 +199,7 @@ for _function in (np.abs, np.sqrt, np.log):
 
 
 def _several(lanes: Lanes | None, count: types.Type) -> types.Type | None:
-    """A tuple of so many vectors; None if `count` is no constant."""
+    """A tuple of `count` vectors; None if `count` is not a constant."""
     return types.UniTuple(lanes, count.literal_value) if lanes and isinstance(count, types.IntegerLiteral) else None
 
 
@@ -208,13 +208,13 @@ _typed(broadcast_each, lambda columns, count, column, n, row: _several(_of(row),
 
 
 def _pointer(context: Any, builder: Any, row_type: Any, row: Any, first: Any) -> Any:
-    """Where the element `first` of an array is."""
+    """Pointer to the element `first` of an array."""
     data = context.make_array(row_type)(context, builder, row).data
     return builder.gep(data, [first])
 
 
 def _vector_pointer(context: Any, builder: Any, row_type: Any, row: Any, first: Any, width: int) -> tuple[Any, int]:
-    """As `_pointer`, of a vector of its elements, and their alignment."""
+    """Pointer to a vector of elements from `first` on, and its alignment."""
     element = context.get_data_type(row_type.dtype)
     place = _pointer(context, builder, row_type, row, first)
     return builder.bitcast(place, ir.VectorType(element, width).as_pointer()), row_type.dtype.bitwidth // 8

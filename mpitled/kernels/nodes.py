@@ -1,4 +1,4 @@
-"""Kernels of nodes: the central-difference update and relaxation, masses, work and energy, packing."""
+"""Kernels of nodes: updates, masses, work and energy, the power iteration, and buffers of the halo."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from mpitled.kernels.tensors import cofactor
 
 
 @njit(cache=True)
-def follow(path, full, turns, amplitude):  # type: ignore[no-untyped-def]
-    """Displacements (n,), m, of dofs at that share of the load on the arcs of `loading.turn`; exact at full load."""
+def rotate_prescribed(path, full, turns, amplitude):  # type: ignore[no-untyped-def]
+    """path (n,) <- displacements, m, of dofs on the arcs of `loading.turn` at a share of the full load."""
     for p in range(path.size):
         angle, arm, across = turns[p, 0], turns[p, 1], turns[p, 2]
         arc = (np.cos(amplitude * angle) - 1) * arm + np.sin(amplitude * angle) * across
@@ -21,12 +21,12 @@ def follow(path, full, turns, amplitude):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def react(u, u_prev, f, mobility, dofs, full, amplitude, reaction):  # type: ignore[no-untyped-def]
+def reaction_work(u, u_prev, f, dt2_over_m, dofs, full, amplitude, reaction):  # type: ignore[no-untyped-def]
     """Work (J) of the reactions at moving dofs over the last step, by the trapezoidal rule; renews the reactions.
 
-    A reaction is f + m a, a being the central difference to the place that the dof is moved to next (4.2.1: the
-    displaced nodes take u_max d(t + dt)); where mobility, dt^2 / m, is None prescribed dofs have no mass. dofs, full
-    (n,): 3 node + direction and metres at full load.
+    A reaction is f + m a, where a is the central difference with the next prescribed displacement (4.2.1: the displaced
+    nodes take u_max d(t + dt)). If dt2_over_m (dt^2 / m, s^2/kg) is None, prescribed dofs have no mass. dofs, full
+    (n,): 3 node + direction, and m at full load.
     """
     work = 0.0
     for p in range(dofs.size):
@@ -35,8 +35,8 @@ def react(u, u_prev, f, mobility, dofs, full, amplitude, reaction):  # type: ign
         now = u[c, node]
         before = u_prev[c, node]
         r = f[c, node]
-        if mobility is not None:
-            r += (amplitude * full[p] - 2 * now + before) / mobility[node]
+        if dt2_over_m is not None:
+            r += (amplitude * full[p] - 2 * now + before) / dt2_over_m[node]
         work += 0.5 * (r + reaction[p]) * (now - before)
         reaction[p] = r
     return work
@@ -55,19 +55,19 @@ def _prescribe(u, fixed, dofs, full, amplitude, copied):  # type: ignore[no-unty
 
 
 @kernel
-def update(u, u_prev, f, mobility, fixed, dofs, full, amplitude, copied):  # type: ignore[no-untyped-def]
+def update(u, u_prev, f, dt2_over_m, fixed, dofs, full, amplitude, copied):  # type: ignore[no-untyped-def]
     """The central difference (eq. 3.3, with the square on dt that 3.2 lacks), then the prescribed dofs; clears f.
 
-    mobility (n_nodes,) is dt^2 / m, s^2/kg. The new displacements overwrite u_prev: the caller swaps the two.
-    fixed (n,) are the dofs that stay, dofs and full (m,) those that move. copied, if given, takes the new displacements
-    in its own precision: a slow ramp's accelerations would be lost in displacements of single precision.
+    dt2_over_m (n_nodes,) is dt^2 / m, s^2/kg. The new displacements overwrite u_prev; the caller swaps the two.
+    fixed (n,) are the dofs that stay; dofs and full (m,) those that move. copied, if given, receives the new
+    displacements in its own precision: the accelerations of a slow ramp would be lost in single precision.
     """
     for c in range(3):
         now = u[c]
         before = u_prev[c]
         fc = f[c]
-        for n in range(U(mobility.size)):
-            after = (now[n] - before[n]) + now[n] - mobility[n] * fc[n]
+        for n in range(U(dt2_over_m.size)):
+            after = (now[n] - before[n]) + now[n] - dt2_over_m[n] * fc[n]
             before[n] = after
             fc[n] = 0
             if copied is not None:
@@ -77,7 +77,7 @@ def update(u, u_prev, f, mobility, fixed, dofs, full, amplitude, copied):  # typ
 
 @inline
 def times(tensor, n, x, y, z):  # type: ignore[no-untyped-def]
-    """The n-th of scalars (1, :), or of symmetric tensors (6, :: xx, xy, xz, yy, yz, zz), times a vector."""
+    """Scalar n of (1, :), or symmetric tensor n of (6, :: xx, xy, xz, yy, yz, zz), times a vector."""
     if tensor.shape[0] == 1:
         m = tensor[0, n]
         return m * x, m * y, m * z
@@ -89,12 +89,12 @@ def times(tensor, n, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def relax(u, u_prev, f, mobility, counted, fixed, dofs, full, amplitude, retain, gain, copied):  # type: ignore[no-untyped-def]
-    """As `update`, with damping, and with a mobility (1, n_nodes) or a tensor of it (6, n_nodes) at each node.
+def relax(u, u_prev, f, dt2_over_m, counted, fixed, dofs, full, amplitude, c1, c2, copied):  # type: ignore[no-untyped-def]
+    """As `update`, with damping, and with scalars dt2_over_m (1, n_nodes) or tensors (6, n_nodes).
 
-    u+ = u + retain (u - u_prev) - gain mobility f: with damping c per step, (2 - c) / (2 + c) and 2 / (2 + c).
-    Returns the work (J) of the internal forces where counted (3, n_nodes) is true, at free dofs that the rank owns:
-    each force times the mean of the steps before and after it.
+    u+ = u + c1 (u - u_prev) - c2 dt2_over_m f; with damping c per step c1 = (2 - c) / (2 + c), c2 = 2 / (2 + c).
+    Returns the work (J) of the internal forces where counted (3, n_nodes) is true: each force times the mean of the
+    steps before and after it.
     """
     half = 0.5
     work = 0.0
@@ -102,13 +102,13 @@ def relax(u, u_prev, f, mobility, counted, fixed, dofs, full, amplitude, retain,
         fx = f[0, n]
         fy = f[1, n]
         fz = f[2, n]
-        x = u[0, n] + retain * (u[0, n] - u_prev[0, n])
-        y = u[1, n] + retain * (u[1, n] - u_prev[1, n])
-        z = u[2, n] + retain * (u[2, n] - u_prev[2, n])
-        mx, my, mz = times(mobility, n, fx, fy, fz)
-        x -= gain * mx
-        y -= gain * my
-        z -= gain * mz
+        x = u[0, n] + c1 * (u[0, n] - u_prev[0, n])
+        y = u[1, n] + c1 * (u[1, n] - u_prev[1, n])
+        z = u[2, n] + c1 * (u[2, n] - u_prev[2, n])
+        mx, my, mz = times(dt2_over_m, n, fx, fy, fz)
+        x -= c2 * mx
+        y -= c2 * my
+        z -= c2 * mz
         work += half * (
             counted[0, n] * fx * (x - u_prev[0, n])
             + counted[1, n] * fy * (y - u_prev[1, n])
@@ -129,23 +129,23 @@ def relax(u, u_prev, f, mobility, counted, fixed, dofs, full, amplitude, retain,
 
 
 @njit(cache=True)
-def change_step(u, u_prev, f, mobility, ratio):  # type: ignore[no-untyped-def]
-    """Rewrites u_prev so that `update` with the new step's mobility takes a step `ratio` times as long as the last.
+def change_step(u, u_prev, f, dt2_over_m, ratio):  # type: ignore[no-untyped-def]
+    """Rewrite u_prev so that `update`, with the dt2_over_m of the new step, takes a step `ratio` times the last one.
 
-    That is u+ = u + r (u - u_prev) - (1 + 1 / r) / 2 mobility f, the central difference with a variable step.
+    That is u+ = u + r (u - u_prev) - (1 + 1 / r) / 2 dt2_over_m f, the central difference with a variable step.
     """
-    gain = 0.5 * (1 + 1 / ratio)
+    factor = 0.5 * (1 + 1 / ratio)
     for c in range(3):
-        for n in range(mobility.size):
+        for n in range(dt2_over_m.size):
             now = u[c, n]
-            u_prev[c, n] = now - ratio * (now - u_prev[c, n]) + (gain - 1) * mobility[n] * f[c, n]
+            u_prev[c, n] = now - ratio * (now - u_prev[c, n]) + (factor - 1) * dt2_over_m[n] * f[c, n]
 
 
 @kernel
-def kinetic_energy(u, u_prev, f, mobility, counted, held):  # type: ignore[no-untyped-def]
+def kinetic_energy(u, u_prev, f, dt2_over_m, counted, held):  # type: ignore[no-untyped-def]
     """Kinetic energy (J) of the counted nodes at the middle of the two half steps around u.
 
-    held (n,) are the prescribed dofs: theirs is taken from the last half step, for f does not move them.
+    held (n,) are the prescribed dofs. Forces do not move them; their energy is that of the last half step.
     """
     half = u.dtype.type(0.5)
     twice = 0.0
@@ -153,30 +153,30 @@ def kinetic_energy(u, u_prev, f, mobility, counted, held):  # type: ignore[no-un
         now = u[c]
         before = u_prev[c]
         fc = f[c]
-        for n in range(U(mobility.size)):
-            v = now[n] - before[n] - half * mobility[n] * fc[n]
-            twice += counted[n] * v * v / mobility[n]
+        for n in range(U(dt2_over_m.size)):
+            v = now[n] - before[n] - half * dt2_over_m[n] * fc[n]
+            twice += counted[n] * v * v / dt2_over_m[n]
     for p in range(held.size):
         n = held[p] // 3
         c = held[p] % 3
         v = u[c, n] - u_prev[c, n]
-        w = v - half * mobility[n] * f[c, n]
-        twice += counted[n] * (v * v - w * w) / mobility[n]
+        w = v - half * dt2_over_m[n] * f[c, n]
+        twice += counted[n] * (v * v - w * w) / dt2_over_m[n]
     return 0.5 * twice
 
 
 @njit(error_model="numpy", cache=True)
-def raise_mass(u, u_prev, mobility, required, counted, time_step):  # type: ignore[no-untyped-def]
-    """Raise each node's mass to what is required; added mass (kg, times 3 directions not counted) and energy (J).
+def raise_mass(u, u_prev, dt2_over_m, required, counted, time_step):  # type: ignore[no-untyped-def]
+    """Raise the mass of each node to the required one (n,), kg; the added mass (kg) and energy (J) at counted nodes.
 
-    The nodes go on at their speed, so that 1/2 dm v^2 comes into the system: a line of the ledger of its own.
+    The nodes keep their velocity, so that 1/2 dm v^2 is added to the system.
     """
     added = 0.0
     energy = 0.0
     for n in range(required.size):
-        dm = required[n] - time_step * time_step / mobility[n]
+        dm = required[n] - time_step * time_step / dt2_over_m[n]
         if dm > 0:
-            mobility[n] = time_step * time_step / required[n]
+            dt2_over_m[n] = time_step * time_step / required[n]
             if counted[n]:
                 added += dm
                 for c in range(3):
@@ -186,24 +186,24 @@ def raise_mass(u, u_prev, mobility, required, counted, time_step):  # type: igno
 
 
 @njit(cache=True)
-def keep_masses(mass, required, free, keep):  # type: ignore[no-untyped-def]
-    """mass <- required, (1, n), or (6, n): symmetric tensors, of which nothing is left at prescribed dofs.
+def limit_mass_decrease(mass, required, free, least_share):  # type: ignore[no-untyped-def]
+    """mass <- required, scalars (1, n) or symmetric tensors (6, n), without the parts of prescribed dofs.
 
-    free (3, n) is true at free dofs. A mass that would fall below `keep` of what it was is scaled up to that: cells
-    that swing stiffen again before the next survey.
+    free (3, n) is true at free dofs. A mass does not fall below `least_share` of what it was: cells that oscillate
+    stiffen again before the next check.
     """
     for n in range(required.shape[1]):
         x = 1.0 if free[0, n] else 0.0
         y = 1.0 if free[1, n] else 0.0
         z = 1.0 if free[2, n] else 0.0
         if required.shape[0] == 1:
-            mass[0, n] = max(required[0, n] * max(x, y, z), keep * mass[0, n])
+            mass[0, n] = max(required[0, n] * max(x, y, z), least_share * mass[0, n])
             continue
         xx = required[0, n] * x
         yy = required[3, n] * y
         zz = required[5, n] * z
         trace = xx + yy + zz
-        least = keep * (mass[0, n] + mass[3, n] + mass[5, n])
+        least = least_share * (mass[0, n] + mass[3, n] + mass[5, n])
         s = least / trace if 0 < trace < least else 1.0
         mass[0, n] = s * xx
         mass[1, n] = s * required[1, n] * x * y
@@ -214,11 +214,11 @@ def keep_masses(mass, required, free, keep):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def invert_masses(mass, free, mobility):  # type: ignore[no-untyped-def]
-    """mobility <- the inverse of masses (1, n), or of tensors (6, n) at their free dofs, and 0 at the others."""
+def invert_masses(mass, free, dt2_over_m):  # type: ignore[no-untyped-def]
+    """dt2_over_m <- the inverse of masses (1, n), or of tensors (6, n), at free dofs, and 0 at the others."""
     for n in range(mass.shape[1]):
         if mass.shape[0] == 1:
-            mobility[0, n] = 1 / mass[0, n] if mass[0, n] > 0 else 0.0
+            dt2_over_m[0, n] = 1 / mass[0, n] if mass[0, n] > 0 else 0.0
             continue
         x = 1.0 if free[0, n] else 0.0
         y = 1.0 if free[1, n] else 0.0
@@ -231,21 +231,21 @@ def invert_masses(mass, free, mobility):  # type: ignore[no-untyped-def]
         xz = mass[2, n] * x * z
         yz = mass[4, n] * y * z
         k0, k1, k2, _, k4, k5, _, _, k8, determinant = cofactor(xx, xy, xz, xy, yy, yz, xz, yz, zz)
-        mobility[0, n] = x * k0 / determinant
-        mobility[1, n] = x * y * k1 / determinant
-        mobility[2, n] = x * z * k2 / determinant
-        mobility[3, n] = y * k4 / determinant
-        mobility[4, n] = y * z * k5 / determinant
-        mobility[5, n] = z * k8 / determinant
+        dt2_over_m[0, n] = x * k0 / determinant
+        dt2_over_m[1, n] = x * y * k1 / determinant
+        dt2_over_m[2, n] = x * z * k2 / determinant
+        dt2_over_m[3, n] = y * k4 / determinant
+        dt2_over_m[4, n] = y * z * k5 / determinant
+        dt2_over_m[5, n] = z * k8 / determinant
 
 
 @njit(cache=True)
-def watch_relaxation(u, u_prev, f, mass, mobility, counted, u_then, f_then):  # type: ignore[no-untyped-def]
-    """What relaxation has to know, of dofs where counted (3, n) is true; renews u_then and f_then (3, n).
+def relaxation_norms(u, u_prev, f, mass, dt2_over_m, counted, u_last, f_last):  # type: ignore[no-untyped-def]
+    """Energies and norms of a relaxation at dofs where counted (3, n) is true; renews u_last and f_last (3, n).
 
-    Kinetic energy; the forces' work in the half step to the present (`relax` counts it with the next step); numerator
-    and denominator of Rayleigh's quotient of the change since then, du . df / du . M du; the largest change in the last
-    step, m; the largest M^-1 f, m (time counts in steps).
+    Returns the kinetic energy; the work of the forces in the last half step (`relax` counts it with the next step);
+    numerator and denominator of Rayleigh's quotient du . df / du . M du of the changes since u_last and f_last; the
+    largest change in the last step, m; and the largest M^-1 f, m (the unit of time is a step).
     """
     kinetic = 0.0
     work = 0.0
@@ -260,27 +260,27 @@ def watch_relaxation(u, u_prev, f, mass, mobility, counted, u_then, f_then):  # 
         vx = x * (u[0, n] - u_prev[0, n])
         vy = y * (u[1, n] - u_prev[1, n])
         vz = z * (u[2, n] - u_prev[2, n])
-        dx = x * (u[0, n] - u_then[0, n])
-        dy = y * (u[1, n] - u_then[1, n])
-        dz = z * (u[2, n] - u_then[2, n])
+        dx = x * (u[0, n] - u_last[0, n])
+        dy = y * (u[1, n] - u_last[1, n])
+        dz = z * (u[2, n] - u_last[2, n])
         fx = x * f[0, n]
         fy = y * f[1, n]
         fz = z * f[2, n]
         mx, my, mz = times(mass, n, vx, vy, vz)
         kinetic += 0.5 * (mx * vx + my * vy + mz * vz)
         work += 0.5 * (fx * vx + fy * vy + fz * vz)
-        numerator += dx * (fx - f_then[0, n]) + dy * (fy - f_then[1, n]) + dz * (fz - f_then[2, n])
+        numerator += dx * (fx - f_last[0, n]) + dy * (fy - f_last[1, n]) + dz * (fz - f_last[2, n])
         mx, my, mz = times(mass, n, dx, dy, dz)
         denominator += mx * dx + my * dy + mz * dz
         change = max(change, vx * vx + vy * vy + vz * vz)
-        ax, ay, az = times(mobility, n, fx, fy, fz)
+        ax, ay, az = times(dt2_over_m, n, fx, fy, fz)
         residual = max(residual, ax * ax + ay * ay + az * az)
-        u_then[0, n] = u[0, n]
-        u_then[1, n] = u[1, n]
-        u_then[2, n] = u[2, n]
-        f_then[0, n] = fx
-        f_then[1, n] = fy
-        f_then[2, n] = fz
+        u_last[0, n] = u[0, n]
+        u_last[1, n] = u[1, n]
+        u_last[2, n] = u[2, n]
+        f_last[0, n] = fx
+        f_last[1, n] = fy
+        f_last[2, n] = fz
     return kinetic, work, numerator, denominator, np.sqrt(change), np.sqrt(residual)
 
 
@@ -317,10 +317,10 @@ def scatter(some, nodes, values):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def scramble(mode, nodes):  # type: ignore[no-untyped-def]
-    """mode (3, n) <- numbers in [-0.5, 0.5), a hash of the nodes' global numbers (n,).
+def hash_random(mode, nodes):  # type: ignore[no-untyped-def]
+    """mode (3, n) <- numbers in [-0.5, 0.5), a hash of the global node numbers (n,).
 
-    So they belong to the nodes, whatever rank these are on (the end of splitmix64; Steele, Lea and Flood 2014).
+    They do not depend on the partition (the end of splitmix64; Steele, Lea and Flood 2014).
     """
     for c in range(3):
         for n in range(mode.shape[1]):
@@ -332,22 +332,22 @@ def scramble(mode, nodes):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def perturb(u, mode, scale, seen):  # type: ignore[no-untyped-def]
-    """seen (3, :) <- u + scale mode, at the nodes of mode (3, n).
+def perturb(u, mode, scale, u_cells):  # type: ignore[no-untyped-def]
+    """u_cells (3, :) <- u + scale mode, at the nodes of mode (3, n).
 
-    Not of the fast kind, which rounds the sum alone: so what is put on no displacement can be taken off to the bit.
+    No fastmath: where u = 0, adding and subtracting the same must be exact.
     """
     for c in range(3):
         for n in range(U(mode.shape[1])):
-            seen[c, n] = u[c, n] + scale * mode[c, n]
+            u_cells[c, n] = u[c, n] + scale * mode[c, n]
 
 
 @kernel
-def respond(mode, f, at_rest, mobility, owned, reach, size):  # type: ignore[no-untyped-def]
-    """A power iteration: the mode (3, n), of which reach / size was tried, becomes mobility times its response K mode.
+def power_iteration(mode, f, at_rest, dt2_over_m, owned, reach, size):  # type: ignore[no-untyped-def]
+    """An iteration: the mode (3, n), tried with the factor reach / size, becomes dt2_over_m times its response K mode.
 
-    f, at_rest (3, :), N, with and without what was tried. Returns, of nodes that are owned, the sums of response times
-    mode over size and of response times the new mode; and the largest component of the new mode.
+    f, at_rest (3, :), N: forces with and without the mode. Returns sums over owned nodes, of response times mode over
+    size and of response times the new mode; and the largest component of the new mode.
     """
     old = 0.0
     new = 0.0
@@ -357,7 +357,7 @@ def respond(mode, f, at_rest, mobility, owned, reach, size):  # type: ignore[no-
         x = per * (f[0, n] - at_rest[0, n])
         y = per * (f[1, n] - at_rest[1, n])
         z = per * (f[2, n] - at_rest[2, n])
-        a, b, c = times(mobility, n, x, y, z)
+        a, b, c = times(dt2_over_m, n, x, y, z)
         if owned[n]:
             old += mode[0, n] * x + mode[1, n] * y + mode[2, n] * z
             new += a * x + b * y + c * z

@@ -6,10 +6,11 @@ from typing import Any
 from mpitled.laws.arrays import first_piola, strain_energy
 from mpitled.laws.law import Law, Tensor
 from mpitled.laws.material import Material
+from mpitled.laws.mooney_rivlin import MooneyRivlin
 from mpitled.laws.neo_hookean import NeoHookean
 
 #: Laws by their names in a deck.
-LAWS: dict[str, type[Law]] = {law.name: law for law in (NeoHookean,)}
+LAWS: dict[str, type[Law]] = {law.name: law for law in (NeoHookean, MooneyRivlin)}
 
 
 def material_of(record: Mapping[str, Any]) -> Material:

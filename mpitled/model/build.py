@@ -193,13 +193,14 @@ def _slips(deck: Deck, mesh: Mesh, material: NDArray[np.int16], materials: tuple
     """Warnings of figures that are possible, but look like slips of the unit: of materials, and of a tumour."""
     told = set()
     for section in deck.materials:
-        name, modulus = f"material.{section.name}", section.youngs_modulus
+        name, solid = f"material.{section.name}", section.material
+        modulus, ratio = solid.youngs_modulus, solid.poissons_ratio
         if not 1 <= modulus <= 1e12:
             told.add(section.name)
             yield f"warning: {name}.youngs_modulus = {modulus:.10g}: is it in Pa? Brain tissue has about 3000"
-        if section.poissons_ratio > LEAST_COMPRESSIBLE:
+        if ratio > LEAST_COMPRESSIBLE + 1e-9:
             yield (
-                f"warning: {name}.poissons_ratio = {section.poissons_ratio:.10g}: results are known up to "
+                f"warning: {name}.poissons_ratio = {ratio:.10g}: results are known up to "
                 f"{LEAST_COMPRESSIBLE:g}; take 0.49, or {LEAST_COMPRESSIBLE:g} at most"
             )
         if not 100 <= section.density <= 25000:

@@ -14,10 +14,12 @@ from mpitled import resources, store
 from mpitled.deck import Deck
 from mpitled.model import Model
 from mpitled.parallel.halo import World
-from mpitled.parallel.subdomain import PRECISIONS, Subdomain, localise
-from mpitled.solver.central_difference import March
-from mpitled.solver.dynamic_relaxation import Relaxation
-from mpitled.solver.run import cell_data
+from mpitled.parallel.subdomain import PRECISIONS, localise
+from mpitled.solver.integrator import Integrator
+from mpitled.solver.integrators import make_integrator
+from mpitled.solver.output import cell_data
+from mpitled.terms import Scene
+from mpitled.terms.term import Method
 
 #: Calls of each term; the fastest counts, because other processes may use the machine as well.
 CALLS = 9
@@ -45,22 +47,21 @@ class Forecast(NamedTuple):
         return f"{steps}, on one rank here; {resources.told(self.output_bytes)} of results"
 
 
-def measure(method: March | Relaxation) -> tuple[dict[str, float], float]:
+def measure(integrator: Integrator) -> tuple[dict[str, float], float]:
     """Seconds of each term of a step at the current state, and of a stability check."""
-    terms = (*method.forces, *method.motion)
-    seconds: dict[str, float] = dict.fromkeys((name for name, _ in terms), math.inf)
+    seconds: dict[str, float] = dict.fromkeys((term.name for term in integrator.step.terms), math.inf)
     for _ in range(CALLS):
         step = dict.fromkeys(seconds, 0.0)
-        for name, act in terms:  # in their order: the exchange ends after it begins
-            step[name] += _seconds(partial(act, method.state))
+        for term in integrator.step.terms:  # in their order: the exchange ends after it begins
+            step[term.name] += _seconds(partial(term.apply, integrator.state))
         seconds = {name: min(least, step[name]) for name, least in seconds.items()}
-    return seconds, min(_seconds(method.look) for _ in range(CALLS))
+    return seconds, min(_seconds(integrator.check) for _ in range(CALLS))
 
 
-def expect(method: March | Relaxation, step: float, check: float, output_bytes: int) -> Forecast:
-    """The forecast for a method before its first step; step and check in s."""
-    at_least = isinstance(method, Relaxation)
-    return Forecast(method.expected_steps, method.expected_surveys, at_least, step, check, output_bytes)
+def expect(integrator: Integrator, step: float, check: float, output_bytes: int) -> Forecast:
+    """The forecast for an integrator before its first step; step and check in s."""
+    at_least = integrator.scene.method is Method.RELAXATION
+    return Forecast(integrator.expected_steps, integrator.expected_checks, at_least, step, check, output_bytes)
 
 
 def forecast(deck: Deck, model: Model) -> Forecast:
@@ -68,23 +69,15 @@ def forecast(deck: Deck, model: Model) -> Forecast:
     with tempfile.TemporaryDirectory() as folder:  # a rank reads its part of a model from a file
         path = Path(folder) / "model.h5"
         store.write_model(path, model, "")
-        sub, method = first_rank(deck, path)
-    method.warm_up()
-    method.begin()
-    seconds, check = measure(method)
-    size = store.result_bytes(sub.rows, deck.output.frames + 1, cell_data(deck))
-    return expect(method, sum(seconds.values()), check, size)
-
-
-def first_rank(deck: Deck, path: Path, ranks: int = 1) -> tuple[Subdomain, March | Relaxation]:
-    """The part of rank 0 of a partitioned model, and its method without other ranks, before its first step."""
-    rows, figures = store.read_part(path, ranks, 0), store.read_figures(path)
-    solver, frames, world = deck.solver, deck.output.frames, World()
-    hourglass, rule, precision = deck.hexahedra.hourglass, deck.hexahedra.gradient, PRECISIONS[solver.precision]
+        rows, figures = store.read_part(path, 1, 0), store.read_figures(path)
+    hourglass, rule, precision = deck.hexahedra.hourglass, deck.hexahedra.gradient, PRECISIONS[deck.solver.precision]
     sub = localise(rows, hourglass, deck.support.stabilisation, rule, precision)
-    if solver.method == "dynamic-relaxation":
-        return sub, Relaxation(solver, frames, sub, world, None, None)
-    return sub, March(solver, frames, sub, world, None, None, figures)
+    integrator = make_integrator(Scene(sub, deck.solver, deck=deck), deck.output.frames, World(), figures)
+    integrator.warm_up()
+    integrator.begin()
+    seconds, check = measure(integrator)
+    size = store.result_bytes(rows, deck.output.frames + 1, cell_data(deck))
+    return expect(integrator, sum(seconds.values()), check, size)
 
 
 def _seconds(act: Callable[[], object]) -> float:

@@ -119,7 +119,7 @@ def _differing(ours: dict[str, Any], theirs: dict[str, Any] | None) -> list[str]
     found = []
     for name, *values in deck.differences(ours, theirs or ours):
         moved = all(isinstance(value, str) for value in values) and len({Path(value).name for value in values}) == 1
-        if deck.is_of_scene(name) and not moved:  # a file may lie elsewhere, and be the same
+        if deck.changes_physics(name) and not moved:  # a file may lie elsewhere, and be the same
             found.append(name)
     return found
 

@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from mpitled import atomic, store, toml
 from mpitled.cells import hexahedra
 from mpitled.deck import GEOMETRIES, unit_of
-from mpitled.job import PAGE
-from mpitled.preview import dry_run as dry
 from mpitled.results import markup, report
 from mpitled.results.report import LARGE, Outcome
 from mpitled.results.solid import Solid
 
+PAGE = "report.html"
 _NO_MATPLOTLIB = "There are no pictures here, for matplotlib is missing: pip install 'mpitled[pictures]'."
 
 
@@ -305,7 +304,7 @@ def _time(run: _Run) -> Iterator[str]:
     yield markup.folded(
         "What the steps do without",
         markup.text(f"A term or an array that a scene does not need is not in its steps{where}"),
-        markup.listed(dry.left_out(run.directory, run.outcome.metadata)),
+        markup.listed(run.outcome.metadata.get("left_out", ())),
     )
 
 

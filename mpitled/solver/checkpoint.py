@@ -1,4 +1,4 @@
-"""Checkpoints: whether there is one that a run can go on from, what goes into it, and what comes out of it."""
+"""Checkpoints: the last one that a run can resume from, what it contains, and whose run it is."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from mpitled.deck import Deck
 from mpitled.errors import InputError
 from mpitled.parallel.halo import World
 from mpitled.parallel.subdomain import Subdomain
-from mpitled.solver.restart import Memory, Packed, Parts, pack, unpack
+from mpitled.terms.restart import Objects, Packed, Scope, Snapshot, pack, unpack
 
 
 class Found(NamedTuple):
-    """A whole checkpoint of the run."""
+    """An intact checkpoint."""
 
     path: Path
-    told: dict[str, Any]
-    damaged: str  # what is wrong with the one that it stands in for; "" if it is the last
+    contents: dict[str, Any]
+    damaged: str  # what is wrong with a later one, which it replaces; "" if there is none
 
 
 def marks(deck: Deck, model_key: str) -> dict[str, Any]:
-    """What tells runs from each other: a run goes on from what has the same marks."""
+    """Identity of a run: a checkpoint with the same marks belongs to it."""
     return {
         "version": __version__,
         "program": decks.program(),
@@ -36,18 +36,18 @@ def marks(deck: Deck, model_key: str) -> dict[str, Any]:
 
 
 def find(directory: Path, deck: Deck, model_key: str) -> Found | None:
-    """The last whole checkpoint in a directory, or None; InputError if it is another run's, or none is whole."""
+    """The last intact checkpoint in a directory, or None; InputError if it is of another run, or none is intact."""
     damaged: list[str] = []
     found = newest(directory, damaged)
-    if found and (what := other(found.told, deck, model_key)):
-        raise InputError(f"{found.path}: {what}; put that back, or remove the file to begin anew")
+    if found and (difference := other(found.contents, deck, model_key)):
+        raise InputError(f"{found.path}: {difference}; put that back, or remove the file to begin anew")
     if damaged and not found:
         raise InputError(f"{'; '.join(damaged)}; begin anew, without --resume")
     return found
 
 
 def newest(directory: Path, damaged: list[str] | None = None) -> Found | None:
-    """The last whole checkpoint in a directory, of whatever run; `damaged` is told what is wrong with others."""
+    """The last intact checkpoint in a directory, of any run; what is wrong with others is appended to `damaged`."""
     damaged = [] if damaged is None else damaged
     for path in (Path(directory) / name for name in store.CHECKPOINTS):
         if path.exists():
@@ -58,13 +58,13 @@ def newest(directory: Path, damaged: list[str] | None = None) -> Found | None:
     return None
 
 
-def reached(told: Mapping[str, Any]) -> str:
+def reached(contents: Mapping[str, Any]) -> str:
     """How far the run of a checkpoint is."""
-    return "after its load" if told["seeks_distance"] else f"at {told['share']:.1%}"
+    return "after its load" if contents["seeks_distance"] else f"at {contents['share']:.1%}"
 
 
 def is_done(directory: Path, deck: Deck, model_key: str) -> bool:
-    """Whether the directory holds the result of the run, whole but for what is made of it afterwards."""
+    """Whether the directory has the complete result of the run; its report may be missing."""
     if store.is_unfinished(directory):
         return False
     try:
@@ -74,38 +74,44 @@ def is_done(directory: Path, deck: Deck, model_key: str) -> bool:
         return False
 
 
-def other(told: dict[str, Any], deck: Deck, model_key: str) -> str:
-    """What of another run is told; "" if it is the same."""
-    here = marks(deck, model_key)
-    if told["program"] != here["program"]:
-        return f"was written by another program (version {told['version']}, this is {__version__})"
-    if what := decks.difference(deck, told["deck"]):
-        return f"was written for {what}"
-    return "" if told["model"] == here["model"] else "was written for another model: a file that the deck reads differs"
+def other(marked: Mapping[str, Any], deck: Deck, model_key: str) -> str:
+    """How the run with other marks differs from this one; "" if it is the same."""
+    ours = marks(deck, model_key)
+    if marked["program"] != ours["program"]:
+        return f"was written by another program (version {marked['version']}, this is {__version__})"
+    if difference := decks.difference(deck, marked["deck"]):
+        return f"was written for {difference}"
+    same = marked["model"] == ours["model"]
+    return "" if same else "was written for another model: a file that the deck reads differs"
 
 
 def save(
-    directory: Path, world: World, sub: Subdomain, about: dict[str, Any], memories: Mapping[str, tuple[Parts, Memory]]
+    directory: Path,
+    world: World,
+    sub: Subdomain,
+    about: dict[str, Any],
+    objects: Objects,
+    snapshots: Mapping[str, tuple[Scope, Snapshot]],
 ) -> None:
-    """Write a checkpoint of memories by name, each with the parts that it is of. Collective."""
-    packed = {name: pack(parts, memory, sub) for name, (parts, memory) in memories.items()}
+    """Write a checkpoint with snapshots of the objects, by name, each with its scope. Collective."""
+    packed = {name: pack(objects, scope, values, sub) for name, (scope, values) in snapshots.items()}
     nodal = {f"{name}/{key}": values for name, of in packed.items() for key, values in of.nodal.items()}
-    own = {f"{name}/{key}": value for name, of in packed.items() for key, value in of.own.items()}
-    alike = {name: of.alike for name, of in packed.items()}
-    told = about | {"own": list(own), "alike": alike}
-    store.write_checkpoint(directory, world.comm, sub.rows, told, nodal, list(own.values()))
+    numbers = {f"{name}/{key}": value for name, of in packed.items() for key, value in of.reduced.items()}
+    replicated = {name: of.replicated for name, of in packed.items()}
+    contents = about | {"reduced": list(numbers), "replicated": replicated}
+    store.write_checkpoint(directory, world.comm, sub.rows, contents, nodal, list(numbers.values()))
 
 
-def load(found: Found, sub: Subdomain) -> Callable[[str, Parts], Memory | None]:
-    """What finds a memory of a checkpoint by its name and its parts; None if there is none of that name."""
+def load(found: Found, sub: Subdomain) -> Callable[[str, Objects, Scope], Snapshot | None]:
+    """The function that reads a snapshot of a checkpoint by its name; None if there is none of that name."""
     nodal, table = store.read_checkpoint(found.path, sub.rows.nodes)
-    numbers = dict(zip(found.told["own"], table.T, strict=True))
+    numbers = dict(zip(found.contents["reduced"], table.T, strict=True))
 
-    def read(name: str, parts: Parts) -> Memory | None:
-        if name not in found.told["alike"]:
+    def read(name: str, objects: Objects, scope: Scope) -> Snapshot | None:
+        if name not in found.contents["replicated"]:
             return None
-        of = {key.removeprefix(f"{name}/"): v for key, v in nodal.items() if key.startswith(f"{name}/")}
-        own = {key.removeprefix(f"{name}/"): v for key, v in numbers.items() if key.startswith(f"{name}/")}
-        return unpack(parts, Packed(of, {}, found.told["alike"][name]), own, sub)
+        of_nodes = {key.removeprefix(f"{name}/"): v for key, v in nodal.items() if key.startswith(f"{name}/")}
+        reduced = {key.removeprefix(f"{name}/"): v for key, v in numbers.items() if key.startswith(f"{name}/")}
+        return unpack(objects, scope, Packed(of_nodes, {}, found.contents["replicated"][name]), reduced, sub)
 
     return read

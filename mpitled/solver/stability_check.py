@@ -1,4 +1,4 @@
-"""The survey of all cells of a rank every few steps: energies, J, and the mass that a stable step needs."""
+"""The check of all cells every few steps: energies, J, and the nodal masses that a stable step needs."""
 
 from __future__ import annotations
 
@@ -8,16 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled.parallel.subdomain import Subdomain
-from mpitled.solver.step import State
+from mpitled.terms import State, Term
+from mpitled.terms.term import StabilityBound
 
 
 @dataclass(slots=True)
-class Survey:
-    """Arrays that a survey fills.
-
-    A step is stable where each node's mass is at least dt^2 / 4 times the sum of its cells' largest eigenvalues, for
-    which the kernels give a bound in the present configuration. The same holds for mass tensors and tensors of bounds.
-    """
+class StabilityCheck:
+    """Collects the shares of all terms in the stability bound, see `StabilityBound`, and their figures."""
 
     sub: Subdomain
     jacobian: NDArray[np.float32] = field(init=False)  # (n_cells + 1,), the last for lanes without a cell
@@ -27,18 +24,19 @@ class Survey:
         self.jacobian = np.ones(self.sub.n_cells + 1, np.float32)
         self.required = np.zeros((1, self.sub.n_nodes))
 
-    def look(self, s: State, safety: float, tensor: NDArray[np.float64] | None = None) -> dict[str, float]:
-        """Energies (J) of this rank's cells by kind, and the smallest J of all steps so far.
+    def evaluate(
+        self, s: State, terms: tuple[Term, ...], safety: float, tensor: NDArray[np.float64] | None = None
+    ) -> dict[str, float]:
+        """This rank's figures of the terms, and "min_jacobian", the smallest J of all steps so far.
 
-        Fills `jacobian` with the cells' J and `required` with the mass that keeps the step `safety` below the bound,
-        without the shares of other ranks. Where tensor (6, n_nodes) is given, what support domains ask goes there.
+        Fills `jacobian`, and `required` with the masses that keep the step at `safety` times the bound, without the
+        shares of other ranks. Support domains add to tensor (6, n_nodes) instead where it is given.
         """
-        sub, required, jacobian = self.sub, self.required[0], self.jacobian
-        required[:] = 0
-        factor = (s.time_step / (2 * safety)) ** 2
-        energies = dict.fromkeys(("strain", "hourglass", "stabilisation"), 0.0)
-        for cells in sub.packed:
-            for name, energy in cells.check(s.seen, required, factor, jacobian, tensor).items():
-                energies[name] += energy
-        s.smallest_jacobian = min(s.smallest_jacobian, float(jacobian[:-1].min()))
-        return energies | {"min_jacobian": s.smallest_jacobian}
+        self.required[:] = 0
+        bound = StabilityBound((s.time_step / (2 * safety)) ** 2, self.required[0], self.jacobian, tensor)
+        found = dict.fromkeys((figure.name for term in terms for figure in term.figures), 0.0)
+        for term in terms:
+            for name, value in term.check(s, bound).items():
+                found[name] += value
+        s.smallest_jacobian = min(s.smallest_jacobian, float(self.jacobian[:-1].min()))
+        return found | {"min_jacobian": s.smallest_jacobian}

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from mpitled import store
+from mpitled.deck import Solver
 from mpitled.kernels import BATCH_LANES
 from mpitled.parallel.subdomain import localise
-from mpitled.solver.step import at_rest, compose_forces, compose_march
+from mpitled.terms import Scene, State, Step
 
 #: R_hg of the paper: any that is not 0.
 HOURGLASS = 0.04 / 9
@@ -109,9 +110,9 @@ def _count(path: Path, stabilisation: float) -> dict[str, float]:
     sub = localise(replace(rows, n_own_domains=whole), HOURGLASS, stabilisation, "mean")
     in_runs = sum(cells.n_cells for cells in sub.packed if cells.name == "voxel hexahedra")
     work = {"voxel hexahedra": in_runs, "hexahedra": n_hexahedra - in_runs, "support domains": whole}
-    sub, state = (with_values(part, _to_counting) for part in (sub, at_rest(sub, 1.0, 1e-6)))
-    terms = (*compose_forces(sub, None), *compose_march(sub))
-    return {name: _operations(act, state) / (work.get(name) or sub.n_nodes) for name, act in terms}
+    sub, state = (with_values(part, _to_counting) for part in (sub, State.at_rest(sub, 1.0, 1e-6)))
+    terms = Step(Scene(sub, Solver(method="quasi-static"))).terms
+    return {term.name: _operations(term.apply, state) / (work.get(term.name) or sub.n_nodes) for term in terms}
 
 
 def _operations(act: Callable[..., None], state: Any) -> int:

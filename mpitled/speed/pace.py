@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 
 from mpitled import store
+from mpitled.deck import Solver
 from mpitled.parallel.halo import Halo, World
 from mpitled.parallel.subdomain import Subdomain, localise
-from mpitled.solver.dynamic_relaxation import Relaxation
-from mpitled.solver.step import State, Term, at_rest, compose_forces, compose_march, compose_relaxation
+from mpitled.solver.dynamic_relaxation import DynamicRelaxation
 from mpitled.speed import limits
 from mpitled.speed.witness import Call, distinct_bytes, witness
+from mpitled.terms import Scene, State, Step, Term
 
 PRECISIONS: dict[str, type[np.floating]] = {"float64": np.float64, "float32": np.float32}
 #: How often a case is timed, and for how many seconds each time; the median counts.
@@ -43,12 +44,12 @@ class Pace:
         """So many steps."""
         state, terms = self.state, self.terms
         for _ in range(n):
-            for _, act in terms:
-                act(state)
+            for term in terms:
+                term.apply(state)
 
     def witnessed(self) -> list[Call]:
         """What a step calls. Collective."""
-        return witness([(name, partial(act, self.state)) for name, act in self.terms])
+        return witness([(term.name, partial(term.apply, self.state)) for term in self.terms])
 
     def work(self) -> dict[str, int]:
         """Cells that the terms of forces have to do."""
@@ -63,20 +64,20 @@ class Pace:
 
 def made(sub: Subdomain, world: World, relaxed: bool = False) -> Pace:
     """The step of a part, marching or in relaxation, in a state that is strained by about 1 %."""
-    state = at_rest(sub, 1.0, _TIME_STEP)
+    state = State.at_rest(sub, 1.0, _TIME_STEP)
     if relaxed:
-        mobility, components = state.mobility, Relaxation.components(sub)
-        state.mobility = np.zeros((components, sub.n_nodes))
-        state.mobility[[0] if components == 1 else [0, 3, 5]] = mobility
+        dt2_over_m, components = state.dt2_over_m, DynamicRelaxation.mass_components(sub)
+        state.dt2_over_m = np.zeros((components, sub.n_nodes))
+        state.dt2_over_m[[0] if components == 1 else [0, 3, 5]] = dt2_over_m
     points = sub.rows.read("points")
     x = points.T
     x = (x - x.mean(axis=1, keepdims=True)) / np.ptp(x)
     strained = _STRAIN * np.ptp(points) * (x[[1, 2, 0]] + np.sin(2 * np.pi * _WAVES * x) / (6 * _WAVES))
-    state.place(strained)
+    state.set_displacement(strained)
     state.time = _SHARE * state.load_time
     halo = Halo(world, sub.shared, 3, sub.precision) if world.size > 1 else None
-    motion = compose_relaxation(sub, np.ones((3, sub.n_nodes), bool)) if relaxed else compose_march(sub)
-    return Pace(sub, state, (*compose_forces(sub, halo), *motion), halo)
+    solver = Solver(method="dynamic-relaxation" if relaxed else "quasi-static")
+    return Pace(sub, state, Step(Scene(sub, solver, halo)).terms, halo)
 
 
 def timed(acts: Mapping[str, Callable[[int], None]], world: World, repeats: int, span: float) -> dict[str, float]:
@@ -183,7 +184,7 @@ def roofline(
     """
     work = pace.work()
     total = by_memory = 0.0
-    for name in dict.fromkeys(name for name, _ in pace.terms):
+    for name in dict.fromkeys(term.name for term in pace.terms):
         if name not in operations:
             continue
         arithmetic = operations[name] * work.get(name, pace.sub.n_nodes) / (2 * multiply_adds)
