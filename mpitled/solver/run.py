@@ -99,7 +99,7 @@ class Run:
     def _use_relaxation(self) -> None:
         """Go on with a relaxation, whatever the method of the deck."""
         scene = self.integrator.scene
-        self._use(replace(scene, solver=replace(scene.solver, method=Method.RELAXATION.value)))
+        self._use(replace(scene, solver=scene.solver.model_copy(update={"method": Method.RELAXATION.value})))
 
     def free(self) -> None:
         """Free the memory that ranks share, at the end of the run. Collective."""
