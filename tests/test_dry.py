@@ -14,7 +14,7 @@ from mpitled.deck import load_deck
 from mpitled.errors import InputError
 from mpitled.job import prepare, run
 from mpitled.parallel.halo import World
-from mpitled.speed.witness import kernel_names
+from mpitled.preview.kernel_trace import kernel_names
 from mpitled.store import open_result
 from mpitled.terms import TERMS, BorderCells, StartHalo
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from exact import shell
 
 from mpitled import job
-from mpitled.batch.exact import shell
 from mpitled.deck import load_deck
 from mpitled.parallel.halo import World
 from mpitled.store import open_result, read_model

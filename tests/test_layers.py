@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import mpitled
+from exact import layers
 from test_kernels import HOURGLASS, at, forces, part
 
 from mpitled import deck, store
-from mpitled.batch.exact import layers
 from mpitled.errors import InputError
 from mpitled.mesh import grid_points, structured_hexahedra
 from mpitled.meshing.cloud import CLOSEST, fill_void, volumes_and_centroids

@@ -182,8 +182,6 @@ def test_the_limit_is_followed_while_a_tumour_grows(tmp_path, cloud, kind):
     # Slow enough that no cell is crushed on the way: that is a state which no step makes stable.
     changes = {"method": kind, "load_time": 0.5, "load_steps": 300}
     method = integrator_of(sub, deck.solver.model_copy(update=changes), figures)
-        sub, deck.solver.model_copy(update={"method": kind, "load_time": 0.5, "load_steps": 300}), figures
-    )
     method.begin()
     step, last, limits = method.step, False, []
     apply(method.state, (*step.forces, *step.work))

@@ -22,8 +22,8 @@ nodes = "z1"
 directions = ["z"]
 displacement = [-1.0]
 """
-#: Runs of some steps, and what they may take by cell. A step's arrays are 93 bytes (`mpitled bench`); the survey, the
-#: last good state and the power iteration's forces are the rest, and in relaxation the states that it goes back to and
+#: Runs of some steps, and what they may take by cell. A step's arrays are 93 bytes (jobs/bench); the survey, the last
+#: good state and the power iteration's forces are the rest, and in relaxation the states that it goes back to and
 #: estimates from.
 RUNS = {
     "dynamic run": ("solver.method=dynamic", "solver.load_time=0.002"),

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-
+import drawing
 import numpy as np
 import pytest
+import relaxation
+import table
 from conftest import ROOT, mpitled
 from scenes import step_of
 from scipy.linalg import eigh
@@ -18,7 +18,7 @@ from mpitled.deck import load_deck
 from mpitled.laws import first_piola
 from mpitled.model import build as model_build
 from mpitled.parallel.subdomain import localise
-from mpitled.results import charts, compare, field
+from mpitled.results import compare, field
 from mpitled.terms import State
 
 CUBE = ROOT / "jobs" / "validation" / "cube.toml"
@@ -28,20 +28,7 @@ PRESSED = ("displaced.0.displacement=[-30]",)
 CONFINED = ("fixed.0.nodes=surface", "fixed.1.nodes=surface")
 
 
-def load(name):
-    spec = importlib.util.spec_from_file_location(name, ROOT / "jobs" / "validation" / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture(scope="module")
-def table():
-    return load("table")
-
-
-def test_a_scene_in_the_table(table, tmp_path, monkeypatch, capsys):
+def test_a_scene_in_the_table(tmp_path, monkeypatch, capsys):
     """The confined cube's compression is homogeneous, so that every mesh has it to what relaxation leaves."""
     confined = ("block.elements=[3,3,3]", "fixed.0.nodes=surface", "fixed.1.nodes=surface", "solver.load_steps=500")
     cube = table.Scene(
@@ -135,7 +122,7 @@ def test_the_pressed_cubes_edge_buckles_unless_short_waves_are_held(tmp_path):
         assert slowest(tmp_path, 0.4, "block.elements=[6,6,6]", f"block.cloud={cloud}")[0] > 0
 
 
-def test_distortion_of_an_affine_field(table, tmp_path):
+def test_distortion_of_an_affine_field(tmp_path):
     """Every corner has the determinant of the gradient, and its least stretch is the compression."""
     found = table.distortion(synthetic(tmp_path / "run", CYLINDER.format(cloud="none")))
     gradient = np.eye(3) + SLOPE
@@ -143,7 +130,7 @@ def test_distortion_of_an_affine_field(table, tmp_path):
     assert found["compression"] == pytest.approx(1 - np.linalg.svd(gradient, compute_uv=False).min(), rel=1e-9)
 
 
-def test_shares_of_a_radial_field(table, tmp_path):
+def test_shares_of_a_radial_field(tmp_path):
     """A field that is a tenth too large everywhere, at nodes and between."""
     text = (ROOT / "jobs" / "validation" / "shell.toml").read_text()
     text = text.replace("element_size = 5.0", "element_size = 12.0")
@@ -156,7 +143,7 @@ def test_shares_of_a_radial_field(table, tmp_path):
 
 
 @pytest.mark.study
-def test_the_expanded_shell_is_that_of_the_closed_form(table, tmp_path, monkeypatch):
+def test_the_expanded_shell_is_that_of_the_closed_form(tmp_path, monkeypatch):
     """Within 2 % of the displacement everywhere but in the first ring around the seed."""
     monkeypatch.setattr(table, "SHELLS", {"fine": table.SHELLS["fine"]})
     (row,) = table.table_shell(tmp_path)
@@ -168,7 +155,6 @@ def test_the_expanded_shell_is_that_of_the_closed_form(table, tmp_path, monkeypa
 @pytest.mark.parametrize("least", [0.3, 1.0, 5.0, 100.0])
 def test_the_shortest_ramp_is_found(tmp_path, monkeypatch, least):
     """From runs that end near the static solution if their load takes so long (s); 100 s are more than are tried."""
-    relaxation = load("relaxation")
 
     def solved(folder, deck, overrides):
         return {"static_distance_mm": relaxation.NEAR * (least / float(folder.name.removeprefix("ramp-"))) ** 2}
@@ -188,8 +174,8 @@ def test_profiles_are_drawn(tmp_path):
     side = np.stack([np.full(11, 50.0), 0 * z, z], axis=1)
     places = np.concatenate([side, side * [-1, 1, 1]])
     true = places * [0.1, 0, 0.2]
-    profile = charts.Profile("cylinder", places, true, {"FE": true + np.array([0.3, 0, 0.4])})
-    _, below = charts.draw_profiles([profile], tmp_path / "p.png").axes
+    profile = drawing.Profile("cylinder", places, true, {"FE": true + np.array([0.3, 0, 0.4])})
+    _, below = drawing.draw_profiles([profile], tmp_path / "p.png").axes
     along, apart = below.lines[0].get_data()
     np.testing.assert_allclose(apart[~np.isnan(apart)], 0.5)
     assert np.isnan(along).sum() == 1

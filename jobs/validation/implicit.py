@@ -137,7 +137,7 @@ def main() -> None:
 
 def _tell(found: dict[tuple[str, str, tuple[str, ...]], list[dict[str, Any]]]) -> None:
     """The table and the figure of the medians of what has been measured, under scene, family and mesh."""
-    from mpitled.results import charts  # not for the runs
+    from drawing import draw_programs  # not for the runs
 
     rows = [
         {"scene": name, "family": family, "mesh": " ".join(mesh)} | _median(measured)
@@ -149,7 +149,7 @@ def _tell(found: dict[tuple[str, str, tuple[str, ...]], list[dict[str, Any]]]) -
         writer.writerows(rows)
     panels = {name: [row for row in rows if row["scene"] == name] for name in SCENES}
     errors = [scene.error for scene in SCENES.values()]
-    charts.draw_rivals(panels, OUT / "implicit.png", "from the deck to displacements on one core, s", errors)
+    draw_programs(panels, OUT / "implicit.png", "from the deck to displacements on one core, s", errors)
 
 
 def _apart(name: str, family: str, mesh: tuple[str, ...]) -> dict[str, Any]:
@@ -223,7 +223,7 @@ def _implicit(
     """FElupe's displacements (n, 3), m, at places (n, 3), and its figures; order 1 is Q1P0, 2 is Q2Q1.
 
     Its volumetric energy is K (J - 1)^2 / 2, so that with K = lambda and the rest of W as the distortional part the law
-    is that of `mpitled.material`.
+    is that of `mpitled.laws.NeoHookean`.
     """
     import felupe
 

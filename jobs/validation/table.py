@@ -19,12 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from drawing import Profile, draw_profiles
 from numpy.typing import NDArray
 
 from mpitled.batch import launch
 from mpitled.cells import hexahedra
 from mpitled.meshing.cloud import on_sphere
-from mpitled.results import charts, compare, field
+from mpitled.results import compare, field
 
 HERE = Path(__file__).parent
 REFERENCES, STUDIES = HERE.parents[1] / "tests" / "data", HERE.parent / "studies"
@@ -253,7 +254,7 @@ def difference(folder: Path, other: Path) -> str:
     return _three(1e3 * apart)
 
 
-def profiles(out: Path) -> list[charts.Profile]:
+def profiles(out: Path) -> list[Profile]:
     """The free sides of the cylinder, and the ellipsoid's surface, in the decks' meshes."""
     found = []
     for scene in SCENES:
@@ -265,7 +266,7 @@ def profiles(out: Path) -> list[charts.Profile]:
                     ours = field.open_field(folder)
                     line = compare.read_reference(REFERENCES / f"{scene.reference}_profile.npz", ours)
                     runs[kind] = 1e3 * ours.at(line.places).displacement
-            found.append(charts.Profile(scene.title, 1e3 * line.places, 1e3 * line.displacement, runs))
+            found.append(Profile(scene.title, 1e3 * line.places, 1e3 * line.displacement, runs))
     return found
 
 
@@ -396,7 +397,7 @@ def main() -> None:
         second = second or list(table_62(out))
         third = third or list(table_shell(out))
         write([*first, *second, *third], markdown(first, second, third))
-        charts.draw_profiles(profiles(out), STUDIES / "validation_profiles.png")
+        draw_profiles(profiles(out), STUDIES / "validation_profiles.png")
 
 
 if __name__ == "__main__":

@@ -100,6 +100,8 @@ def _refusal(errors: Sequence[Any], table: dict[str, Any], source: _Source) -> I
     if error["type"] == "extra_forbidden":
         sections = () if home.section else [other.section for other in homes()[1:] if not other.law]
         return source.error(way, _unknown(way[-1], home.section, [*keys, *sections]), value)
+    if error["type"] == "value_error":  # of a law, on parameters that do not fit each other
+        return source.error(way, str(error["ctx"]["error"]), _ABSENT)
     if len(way) < home.depth:
         return source.error(way, f"is not a section; write {home.heading} above its keys", value)
     key = keys[way[-1]]

@@ -29,8 +29,8 @@ class MooneyRivlin(Law):
     def _volumetric_term_is_positive(self) -> MooneyRivlin:
         if self.coefficients[2] < 0:
             # lambda = 4 c01 at this ratio.
-            least = self.c01 / (self.mu + 2 * self.c01) * 2
-            raise ValueError(f"poissons_ratio is too small for this c01; give more than {least:.3g}")
+            least = 2 * self.c01 / (self.mu + 4 * self.c01)
+            raise ValueError(f"poissons_ratio is too small for this c01; give at least {least:.3g}")
         return self
 
     @property

@@ -17,7 +17,7 @@ from mpitled.deck import Deck
 from mpitled.errors import everywhere
 from mpitled.parallel.halo import World
 from mpitled.preview import forecast
-from mpitled.speed.witness import Call, distinct_bytes, witness
+from mpitled.preview.kernel_trace import Call, distinct_bytes, trace_kernels
 from mpitled.terms.term import Method
 
 
@@ -32,8 +32,8 @@ def dry_run(deck: Deck, directory: Path, world: World, *, verbose: bool = False)
     with everywhere():
         run.integrator.begin()
     integrator, sub = run.integrator, run.sub
-    calls = witness([(term.name, partial(term.apply, integrator.state)) for term in integrator.step.terms])
-    check_calls = witness([("stability check", integrator.check)])
+    calls = trace_kernels([(term.name, partial(term.apply, integrator.state)) for term in integrator.step.terms])
+    check_calls = trace_kernels([("stability check", integrator.check)])
     seconds, check = forecast.measure(integrator)
     step = sum(seconds.values())
     counts = [sub.rows.n_own_hexahedra, sub.rows.n_own_domains, sub.n_nodes, sum(len(nodes) for _, nodes in sub.shared)]

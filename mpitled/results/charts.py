@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from matplotlib.ticker import LogLocator, MaxNLocator, PercentFormatter
 from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
@@ -127,78 +125,6 @@ def draw_study(rows: list[dict[str, Any]], path: Path, error: str) -> Figure:
     return figure
 
 
-@dataclass(frozen=True, slots=True)
-class Profile:
-    """A line on a body's surface in the plane y = 0, deformed as a reference and as runs have it; all (n, 3), mm."""
-
-    title: str
-    places: NDArray[np.float64]  # undeformed, in order; a gap where they are far apart
-    reference: NDArray[np.float64]  # displacements
-    runs: dict[str, NDArray[np.float64]]  # label -> displacements
-
-
-def draw_profiles(profiles: Sequence[Profile], path: Path) -> Figure:
-    """Draw and save each profile as it is deformed, and below it how far each run is from the reference along it."""
-    figure = Figure(figsize=(4.6 * len(profiles), 8), layout="constrained")
-    FigureCanvasAgg(figure)
-    panels = figure.subplots(2, len(profiles), squeeze=False, height_ratios=[2, 1])
-    for (above, below), profile in zip(panels.T, profiles, strict=True):
-        steps = np.linalg.norm(np.diff(profile.places, axis=0), axis=1)
-        gaps = np.flatnonzero(steps > 4 * np.median(steps)) + 1
-        steps[gaps - 1] = np.median(steps)
-        along = np.insert(np.cumsum(np.insert(steps, 0, 0.0)), gaps, np.nan)
-
-        def line(displacement: NDArray[np.float64] | float, profile: Profile = profile, gaps: Any = gaps) -> Any:
-            return np.insert(profile.places + displacement, gaps, np.nan, axis=0)[:, [0, 2]].T
-
-        above.plot(*line(0.0), color=_INK, linewidth=0.8, linestyle=":", label="undeformed")
-        above.plot(
-            *line(profile.reference), color=_INK, linestyle="", marker="o", markersize=5, markerfacecolor="none",
-            label="reference",
-        )  # fmt: skip
-        for i, (label, displacement) in enumerate(profile.runs.items(), 1):
-            style: dict[str, Any] = {"color": _COLOURS[i], "linestyle": ("--", "-", "-.")[i % 3], "linewidth": 1.2}
-            above.plot(*line(displacement), label=label, **style)
-            apart = np.linalg.norm(displacement - profile.reference, axis=1)
-            below.plot(along, np.insert(apart, gaps, np.nan), label=label, **style)
-        wide, high = np.ptp((profile.places + profile.reference)[:, [0, 2]], axis=0)
-        aspect = "equal" if wide > high / 4 else "auto"  # one side alone shows nothing on equal scales
-        above.set(title=profile.title, xlabel="x, mm", ylabel="z, mm", aspect=aspect)
-        below.set(xlabel="along the undeformed line, mm", ylabel="distance from reference, mm", ylim=(0, None))
-        below.grid(True, linewidth=0.3)
-    handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
-    figure.savefig(path, dpi=120)
-    return figure
-
-
-def draw_prediction(rows: list[dict[str, Any]], subject: str, assumptions: str, path: Path) -> None:
-    """Efficiency against the number of parts, as predicted, and what of it the balance alone would leave."""
-    figure = Figure(figsize=(8, 5.5), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    parts = [row["parts"] for row in rows]
-    lines = {
-        "balance of the partition alone": [100 / row["balance"] for row in rows],
-        "exchange overlapped with computing": [100 * row["efficiency_overlapped"] for row in rows],
-        "exchange after computing": [100 * row["efficiency"] for row in rows],
-    }
-    for i, (label, values) in enumerate(lines.items()):
-        axes.plot(parts, values, label=label, color=_COLOURS[i], marker=_MARKERS[i], linewidth=1.2)
-    for row in rows:
-        text = f"{row['cells_mean']:,.0f} cells\n{row['step_us']:,.0f} \u00b5s a step"
-        place = (row["parts"], 100 * row["efficiency"])
-        axes.annotate(text, place, xytext=(-8, -8), textcoords="offset points", fontsize=7, ha="right", va="top")
-    axes.set(xscale="log", ylim=(0, 105), xlabel="ranks", ylabel="predicted efficiency, %")
-    axes.set_xticks(parts, [str(n) for n in parts])
-    axes.minorticks_off()
-    axes.margins(x=0.22)
-    axes.grid(True, linewidth=0.3)
-    axes.legend(fontsize=8, loc="lower left")
-    axes.set_title(f"{subject}: {assumptions}", fontsize=8, loc="left")
-    figure.savefig(path, dpi=150)
-
-
 def draw_quantities(
     families: Mapping[str, Sequence[Mapping[str, Any]]],
     key: str,
@@ -256,33 +182,6 @@ def draw_cost(points: Sequence[tuple[float, float, str]], path: Path) -> None:
         axes.plot(seconds, distance, color=_COLOURS[1], marker="o", linestyle="none")
     _logarithmic(axes, "time of the loop, s", "from the static solution, by its own estimate, mm")
     _name_points(figure, axes, [_Name(seconds, distance, name, _INK) for seconds, distance, name in points], size=8)
-    figure.savefig(path, dpi=150)
-
-
-def draw_rivals(panels: dict[str, list[dict[str, Any]]], path: Path, time: str, errors: Sequence[str]) -> None:
-    """Error against run time of programs ("family") that solve the same scenes: a panel each, a point for each mesh.
-
-    The panels' rows hold "seconds", "max_error_mm" and "unknowns"; `time` and, one for each panel, `errors` are labels.
-    """
-    figure = Figure(figsize=(6 * len(panels), 5.5), layout="constrained")
-    FigureCanvasAgg(figure)
-    every = figure.subplots(1, len(panels), squeeze=False)[0]
-    for axes, (title, rows), error in zip(every, panels.items(), errors, strict=True):
-        for i, family in enumerate(dict.fromkeys(row["family"] for row in rows)):
-            points = [row for row in rows if row["family"] == family]
-            seconds, found = ([row[name] for row in points] for name in ("seconds", "max_error_mm"))
-            colour = _COLOURS[i + 1]
-            beside = {
-                "textcoords": "offset points",
-                "xytext": ((5, 4), (-5, -9))[i % 2],
-                "ha": ("left", "right")[i % 2],
-            }
-            axes.plot(seconds, found, label=family, linewidth=1.2, color=colour, marker=_MARKERS[i])
-            for x, y, row in zip(seconds, found, points, strict=True):
-                axes.annotate(f"{row['unknowns']:,}", (x, y), fontsize=7, color=colour, **beside)
-        _logarithmic(axes, time, error)
-        axes.set_title(title)
-    every[0].legend(fontsize=8, title="numbers: unknowns")
     figure.savefig(path, dpi=150)
 
 
@@ -352,81 +251,3 @@ def draw_balance(grown: float, found: Mapping[str, float], path: _To) -> None:
     axes.set_xlabel("volume (mm\u00b3)")
     figure.legend(loc="outside lower center", ncols=3, frameon=False)
     figure.savefig(path, dpi=110)
-
-
-#: Outcomes of the stability matrix as colours of fill and text, of different lightness too.
-_OUTCOMES = {
-    "completed": ("#cbe7f8", _INK),
-    "stopped": ("#f0c75e", _INK),
-    "warned": ("#b8b8b8", _INK),
-    "buckled": ("#7a9a8f", _INK),
-    "wrong": ("#5a1f00", "#ffffff"),
-}
-_CELL = (0.82, 0.2)  # inches
-_MARGIN, _HEAD, _WIDTH = 1.5, 0.62, 6.6  # inches left of a panel's cells, above them, and of a panel with both
-_PANELS = 3  # beside one another
-#: What the words of a cell mean.
-_SAID = (
-    "number: largest difference from the reference (a closed form or another run), mm; percentage: share of the load",
-    "completed: it is at most 3 times what run and reference say of themselves, above all how far from rest they are;",
-    "a ramp that is millimetres off completes if it says that it is",
-    "warned: it is more, and was warned of; buckled: more, with less energy than the closed form; wrong: none of these",
-)
-
-
-def draw_matrix(rows: list[dict[str, Any]], path: Path) -> Figure:
-    """The stability matrix: a panel for each axis, kinds and methods down, values across, what became of it in words.
-
-    Completed runs have their error in mm, stopped ones the share of the load that they had, or that they were refused.
-    Rows may be those of the table, all of whose values are text.
-    """
-    panels: dict[str, list[dict[str, Any]]] = {}
-    for row in rows:
-        panels.setdefault(row["axis"], []).append(row)
-    filled = [0.4 + 0.16 * len(_SAID)] * _PANELS  # inches from the top, for the legend first
-    places = {}
-    for name, cells in panels.items():
-        column = filled.index(min(filled))
-        runs = list(dict.fromkeys((cell["kind"], cell["method"]) for cell in cells))
-        places[name] = column, filled[column], runs
-        filled[column] += _HEAD + _CELL[1] * len(runs)
-    width, height = _WIDTH * min(_PANELS, len(panels)), max(filled) + 0.1
-    figure = Figure(figsize=(width, height))
-    FigureCanvasAgg(figure)
-    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0))
-    axes.axis("off")
-    for i, (outcome, (colour, ink)) in enumerate(_OUTCOMES.items()):
-        _cell(axes, 0.1 + i * 1.2 * _CELL[0], 0.1, outcome, colour, ink)
-    for i, words in enumerate(_SAID):
-        axes.text(0.1, 0.42 + 0.16 * i, words, fontsize=7, va="center", color=_INK)
-    for name, (column, top, runs) in places.items():
-        left, top = column * _WIDTH + _MARGIN, top + _HEAD
-        values = list(dict.fromkeys(cell["value"] for cell in panels[name]))
-        title = f"{name}: {panels[name][0]['about']}"
-        axes.text(left - _MARGIN + 0.1, top - 0.32, title, fontsize=8, fontweight="bold", color=_INK)
-        for i, value in enumerate(values):
-            axes.text(left + (i + 0.5) * _CELL[0], top - 0.05, value, fontsize=7, ha="center", color=_INK)
-        for j, (kind, method) in enumerate(runs):
-            y = top + (j + 0.5) * _CELL[1]
-            axes.text(left - 0.08, y, f"{kind}, {method}", fontsize=7, ha="right", va="center", color=_INK)
-        for cell in panels[name]:
-            i, j = values.index(cell["value"]), runs.index((cell["kind"], cell["method"]))
-            colours = _OUTCOMES[cell["outcome"]]
-            _cell(axes, left + i * _CELL[0], top + j * _CELL[1], _words(cell), *colours)
-    figure.savefig(path, dpi=150)
-    return figure
-
-
-def _cell(axes: Any, x: float, y: float, text: str, colour: str, ink: str) -> None:
-    axes.add_patch(Rectangle((x, y), *_CELL, facecolor=colour, edgecolor="#ffffff", linewidth=0.8))
-    middle = x + 0.5 * _CELL[0], y + 0.5 * _CELL[1]
-    axes.text(*middle, text, fontsize=7, ha="center", va="center", color=ink)
-
-
-def _words(cell: dict[str, Any]) -> str:
-    """What a cell of the matrix has to say."""
-    if cell["error_mm"] != "":
-        return f"{float(cell['error_mm']):.2g}"
-    reached = re.search(r"unstable at ([\d.]+%)", cell["message"])
-    ended = {"3": "stalled", "2": "refused", "0": "error unsaid"}
-    return reached[1] if reached else ended.get(str(cell["status"]), "no end")

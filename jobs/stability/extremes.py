@@ -1,20 +1,15 @@
-"""The scenes of the stability matrix: small decks taken to extremes, an axis for each way there, as data.
+"""The scenes of the stability matrix as data: an axis is a small deck, and values that take it to an extreme.
 
-An axis is a deck and values; a value is what `--set` takes, words apart by blanks. Words that begin with "grid." make
-the mesh that the deck reads (see `write_grid`), "reference.tolerance=" sets a key of the solver for the run that is the
-reference alone, and "0.95*critical" is that share of the model's critical step.
+A value is a list of overrides (see `mpitled run --set`), separated by blanks. Overrides of "grid" make the mesh that
+the deck reads (see `grid.write_grid`). "reference.tolerance=" sets a key of the solver only for the run that is the
+reference. "0.95*critical" is a share of the model's critical time step.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-
-from mpitled.cells import hexahedra
-from mpitled.mesh import grid_points, structured_hexahedra
 
 _MATERIAL = """
 [material.brain]
@@ -27,7 +22,7 @@ _SOLVER = "[solver]\nload_time = 0.5\n[output]\nframes = 1\npictures = false\n"
 
 
 def _slides(*sets: str) -> str:
-    """Faces that stay in their planes."""
+    """Faces that slide in their planes."""
     return "".join(f'[[fixed]]\nnodes = "{name}"\ndirections = ["{name[0]}"]\n' for name in sets)
 
 
@@ -66,12 +61,12 @@ _BAR = "[block]\nsize = [20.0, 20.0, 80.0]\nelements = [6, 6, 24]\n"
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """A way to an extreme."""
+    """A scene and the values that take it to an extreme."""
 
-    about: str  # what is computed, and what the values are
+    about: str  # the scene, and the meaning of the values
     deck: str
-    values: dict[str, str]  # as they are called -> what they set
-    reference: str  # of displacements: a closed form of `exact`, or another run: "relaxed" or "quarter"
+    values: dict[str, str]  # name -> overrides
+    reference: str  # displacements: a closed form of `exact`, or another run, "relaxed" or "quarter"
     kinds: tuple[str, ...] = ("FE", "mixed", "EFG")
     methods: tuple[str, ...] = ("ramp", "relaxation")
 
@@ -81,7 +76,7 @@ class Axis:
         return next(name for name in KINDS if f"[{name}]" in self.deck)
 
 
-#: What makes the same scene of hexahedra, of both, or of support domains, for each geometry.
+#: Overrides for hexahedra only, for a mixed model, and for support domains only, for each geometry.
 KINDS = {
     "block": {"FE": "block.cloud=none", "mixed": "block.cloud=core", "EFG": "block.cloud=all"},
     "ellipsoid": {"FE": "ellipsoid.cloud=none", "mixed": "ellipsoid.cloud=core", "EFG": "ellipsoid.cloud=all"},
@@ -100,23 +95,23 @@ METHODS = {
 
 
 def _brain(key: str, *values: float, time: float = 0.5) -> dict[str, str]:
-    """Values of the one material's key, with as many transits of waves as there are in that load time, s, without."""
-    faster = {"youngs_modulus": 3000.0, "density": 1000.0}.get(key)
+    """Values of a key of the material; the load time (s) is scaled so that waves cross the body equally often."""
+    usual = {"youngs_modulus": 3000.0, "density": 1000.0}.get(key)
     words = {}
     for value in values:
-        ratio = value / faster if faster else 1.0
+        ratio = value / usual if usual else 1.0
         scale = ratio ** (0.5 if key == "density" else -0.5)
         words[f"{value:g}"] = f"material.brain.{key}={value!r} solver.load_time={time * scale:.6g}"
     return words
 
 
 def _pulled(*percent: int, at: str = "[{:g}]") -> dict[str, str]:
-    """The upper end moved by percents of the height."""
+    """Displacements of the upper end in percent of the height."""
     return {f"{p} %": f"displaced.0.displacement={at.format(0.24 * p)}" for p in percent}
 
 
 def _sheared(*amounts: float) -> dict[str, str]:
-    """Every level of nodes on the surface moved along x by that many times its height."""
+    """Shear: each level of surface nodes moves along x by the amount times its height."""
     return {
         f"{amount:g}": " ".join(f"displaced.{k}.displacement=[{3 * amount * k:g},0,0]" for k in _LEVELS)
         for amount in amounts
@@ -124,15 +119,15 @@ def _sheared(*amounts: float) -> dict[str, str]:
 
 
 def _tumours(*radii: tuple[float, float]) -> dict[str, str]:
-    """Tumours that grow from a radius to another (mm), by the ratio of both."""
+    """Tumours that grow from one radius to another (mm), named by the ratio."""
     words = "tumour.seed_radius={} tumour.volume={:.8g}"
     return {f"{R / r:g}" + ("" if r == 2 else f" ({R:g} mm)"): words.format(r, 4 / 3 * np.pi * R**3) for r, R in radii}
 
 
 _CONTRASTS = (1e2, 1e4, 1e6)
-_COARSE = {1e6: " reference.tolerance=3e-3"}  # mm: at such a contrast round-off comes no nearer than 2e-3
+_COARSE = {1e6: " reference.tolerance=3e-3"}  # mm; round-off prevents less than 2e-3 at this contrast
 _SHARES = (0.5, 0.95, 1.05, 2.0)
-_FAST = 0.02  # s, of which a shear wave takes 24 ms to cross the block
+_FAST = 0.02  # s; a shear wave crosses the block in 24 ms
 _TOGETHER = "[0,0,{:g}]"
 
 AXES: dict[str, Axis] = {
@@ -208,91 +203,3 @@ AXES: dict[str, Axis] = {
         "no such set": "displaced.0.nodes=top",
     }, "stretched", ("mixed",)),
 }  # fmt: skip
-
-
-def write_grid(folder: Path, words: dict[str, str]) -> None:
-    """Abaqus decks, in mm: grid.inp of a box of hexahedra, and inner.inp and all_cells.inp of the cloud's nodes.
-
-    areas.csv has the outer surface's areas at its nodes. Node sets are x0 to z1, surface and level0, level1, ... (what
-    of it is so many cells above z = 0); cell sets all_cells, inner (4 x 4 x 4 in the middle) and upper (half). Words:
-    elements and size along x, y, z; thin, the share of a cell's thickness that the middle one has along x, y, z; skew,
-    the smallest scaled Jacobian that inner nodes are moved to; flaw, of those that people make.
-    """
-    nx, ny, nz = shape = [int(n) for n in words.get("elements", "8,8,8").split(",")]
-    size = [float(length) for length in words.get("size", "24,24,24").split(",")]
-    points, cells = grid_points((nx, ny, nz), (size[0], size[1], size[2])), structured_hexahedra((nx, ny, nz))
-    index = np.rint(points / size * shape).astype(int)
-    for axis, ratio in enumerate(map(float, words.get("thin", "1,1,1").split(","))):
-        # The plane after the middle is drawn near to it; the layer beyond has what this one loses.
-        cell = size[axis] / shape[axis]
-        points[index[:, axis] == shape[axis] // 2 + 1, axis] -= (1 - ratio) * cell if ratio < 1 else 0.0
-    inside = np.asarray(np.logical_and(index > 0, index < shape).all(axis=1))
-    if "skew" in words:
-        points = _skewed(points, cells, inside, float(words["skew"]))
-    gradients, volumes = hexahedra.geometry(points, cells)
-    areas = hexahedra.nodal_sum(cells, volumes[:, None, None] * gradients, len(points))
-    table = (f"{i + 1},{','.join(map(repr, areas[i].tolist()))}\n" for i in np.flatnonzero(~inside))
-    (folder / "areas.csv").write_text("node,x,y,z\n" + "".join(table))
-    sets = {f"{a}{end}": index[:, i] == end * shape[i] for i, a in enumerate("xyz") for end in (0, 1)}
-    sets |= {"surface": ~inside} | {f"level{k}": ~inside & (index[:, 2] == k) for k in range(shape[2] + 1)}
-    middle = index[cells].mean(axis=1) / shape
-    parts = {
-        "all_cells": np.ones(len(cells), bool),
-        "inner": (np.abs(middle - 0.5) < 0.25).all(axis=1),
-        "upper": middle[:, 2] > 0.5,
-    }
-    first, flaw = int(np.flatnonzero(parts["inner"])[0]) if parts["inner"].any() else 0, words.get("flaw", "")
-    if flaw == "repeated":
-        cells = np.concatenate([cells, cells[first : first + 1]])
-        parts = {name: np.append(chosen, chosen[first]) for name, chosen in parts.items()}
-    elif flaw == "inverted":
-        cells[first] = cells[first, [4, 5, 6, 7, 0, 1, 2, 3]]
-    elif flaw == "flat":
-        points[cells[first, 4:]] = points[cells[first, :4]]
-    more = np.empty(0, np.int64)  # nodes whose places are taken by more nodes
-    if flaw in ("twins", "open"):
-        more = np.flatnonzero(index[:, 2] == shape[2] // 2)
-    elif flaw == "strays":
-        more = np.arange(9)
-    points = np.concatenate([points, points[more] + (100.0 if flaw == "strays" else 0.0)])
-    sets = {name: np.concatenate([chosen, chosen[more] & (flaw == "open")]) for name, chosen in sets.items()}
-    if flaw == "open":
-        other = np.arange(len(points) - len(more))
-        other[more] = len(other) + np.arange(len(more))
-        cells = np.where(parts["upper"][:, None], other[cells], cells)
-    text = "*NODE\n" + _rows(np.arange(len(points)), points) + "*ELEMENT, TYPE=C3D8R\n"
-    text += _rows(np.arange(len(cells)), cells + 1)
-    text += "".join(f"*ELSET, ELSET={name}\n{_numbers(chosen)}" for name, chosen in parts.items())
-    (folder / "grid.inp").write_text(text + _node_sets(sets))
-    for name in ("all_cells", "inner"):
-        own = np.zeros(len(points), bool)
-        own[cells[parts[name]]] = True
-        own[len(index) :] = flaw != ""
-        text = "*NODE\n" + _rows(np.flatnonzero(own), points[own])
-        (folder / f"{name}.inp").write_text(text + _node_sets({key: chosen & own for key, chosen in sets.items()}))
-
-
-def _rows(numbers: NDArray[np.int64], table: NDArray[np.generic]) -> str:
-    pairs = zip(numbers.tolist(), table.tolist(), strict=True)
-    return "".join(f"{number + 1}, {', '.join(map(repr, row))}\n" for number, row in pairs)
-
-
-def _numbers(chosen: NDArray[np.bool_]) -> str:
-    return "".join(f"{i + 1}\n" for i in np.flatnonzero(chosen))
-
-
-def _node_sets(sets: dict[str, NDArray[np.bool_]]) -> str:
-    return "".join(f"*NSET, NSET={name}\n{_numbers(chosen)}" for name, chosen in sets.items() if chosen.any())
-
-
-def _skewed(
-    points: NDArray[np.float64], cells: NDArray[np.int64], inside: NDArray[np.bool_], worst: float
-) -> NDArray[np.float64]:
-    """Points whose inner ones are moved at random, just as far as makes the smallest scaled Jacobian `worst`."""
-    shift = np.where(inside[:, None], np.random.default_rng(0).uniform(-1, 1, points.shape), 0.0)
-    low, high = 0.0, float(np.linalg.norm(points[cells[0, 1]] - points[cells[0, 0]]))
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        sound = hexahedra.scaled_jacobian(points + middle * shift, cells).min() > worst
-        low, high = (middle, high) if sound else (low, middle)
-    return points + low * shift

@@ -1,8 +1,9 @@
-"""What one core of this machine can do at best, by kernels made as ours are: memory's bandwidth and multiply-adds."""
+"""The limits of one core: memory bandwidth and multiply-adds per second, with kernels built like those of the step."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 from numba import njit
@@ -11,17 +12,16 @@ from numpy.typing import DTypeLike
 
 from mpitled.kernels.lanes import load, store, width
 
-#: Bytes of the triad that is told as the machine's: beyond what a core has of caches.
+#: Bytes of the triad that stands for the machine: more than a core's caches hold.
 LARGE = 3 << 27
-#: Smallest working set, bytes: a kernel's call must not count.
-_SMALL = 3 << 14
-_CHAINS, _LINKS = 8, 8
-_VALUES = 1 << 10  # stay in the first cache
+#: Smallest working set, bytes, and the values of the chains, which stay in the first cache.
+SMALL, VALUES = 3 << 14, 1 << 10
+CHAINS, LINKS = 8, 8
 
 
 def triad(n_bytes: int, repeats: int = 7) -> float:
-    """Bytes a second of a = b + s c on arrays that together have so many bytes; the best of some repeats (STREAM)."""
-    n = max(n_bytes, _SMALL) // 24
+    """Bytes per second of a = b + s c on arrays of n_bytes in all; the best of some repeats (STREAM)."""
+    n = max(n_bytes, SMALL) // 24
     a, b, c = np.zeros(n), np.ones(n), np.ones(n)
     rounds = max(1, int(2e8) // (24 * n))
     _triad(a[:8], b[:8], c[:8], 0.5, 1)
@@ -29,34 +29,32 @@ def triad(n_bytes: int, repeats: int = 7) -> float:
 
 
 def multiply_adds(dtype: DTypeLike, repeats: int = 7) -> float:
-    """Multiply-adds a second in registers, in eight chains that need not wait for each other; the best of repeats."""
-    values = np.linspace(0.5, 1.0, _VALUES).astype(dtype)
-    addend = values.dtype.type(0.001)
-    rounds = 400
+    """Multiply-adds per second in registers, in eight independent chains; the best of some repeats."""
+    values = np.linspace(0.5, 1.0, VALUES).astype(dtype)
+    addend, rounds = values.dtype.type(0.001), 400
     _chains(values, addend, 1)
-    best = _best(lambda: _chains(values, addend, rounds), repeats)
-    return _VALUES * _CHAINS * _LINKS * rounds / best
+    return VALUES * CHAINS * LINKS * rounds / _best(lambda: _chains(values, addend, rounds), repeats)
 
 
-def _best(act, repeats: int) -> float:  # type: ignore[no-untyped-def]
+def _best(execute: Callable[[], object], repeats: int) -> float:
     seconds = []
     for _ in range(repeats):
         begin = time.perf_counter()
-        act()
+        execute()
         seconds.append(time.perf_counter() - begin)
     return min(seconds)
 
 
 @njit(fastmath={"contract"}, cache=True)
-def _triad(a, b, c, s, rounds):  # type: ignore[no-untyped-def]
+def _triad(a, b, c, s, rounds):
     for _ in range(rounds):
         for i in range(U(a.size)):
             a[i] = b[i] + s * c[i]
 
 
 @njit(fastmath={"contract"}, cache=True)
-def _chains(values, d, rounds):  # type: ignore[no-untyped-def]
-    # Squares: free association could do a chain of products with one factor in fewer steps.
+def _chains(values, d, rounds):
+    # Squares: the compiler could shorten a chain of products with a constant factor.
     for _ in range(rounds):
         for i in range(U(0), U(values.size), width(values)):
             x0 = load(values, i)
@@ -67,7 +65,7 @@ def _chains(values, d, rounds):  # type: ignore[no-untyped-def]
             x5 = x4 + d
             x6 = x5 + d
             x7 = x6 + d
-            for _link in range(_LINKS):
+            for _link in range(LINKS):
                 x0 = x0 * x0 + d
                 x1 = x1 * x1 + d
                 x2 = x2 * x2 + d

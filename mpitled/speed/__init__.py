@@ -1,1 +1,0 @@
-"""How fast and how large a run is: measured, counted and predicted."""
