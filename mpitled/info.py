@@ -203,6 +203,8 @@ def _parts() -> list[_Part]:
         package("numba", "the kernels"),
         package("numpy", "everything"),
         package("scipy", "building models"),
+        package("pydantic", "decks"),
+        package("rich", "tables and progress of sweeps"),
         package("meshio", "meshes of other programs"),
         package("nibabel", "label images", "images", needed=False),
         package("matplotlib", "the report's pictures", "pictures", needed=False),

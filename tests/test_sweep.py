@@ -314,7 +314,7 @@ def test_what_cannot_be_swept_is_said_before_anything_runs(tmp_path):
             cases.plan(CUBE, vary.grid(texts), [], 1, out)
     for text, message in (
         ("", "has no cases"),
-        ("a,a\n1,2\n", "a key twice"),
+        ("a,a\n1,2\n", "line 1: has a key twice"),
         ("a,b\n1\n", "line 2: has 1 values for 2 keys"),
         ("a;b\n1,5;2\n", "line 1: separate by commas, not semicolons"),
         ("# of today\nsolver.load_step\n\n5\n", "line 4: solver.load_step = 5: unknown key; did you mean load_steps"),

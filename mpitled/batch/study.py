@@ -160,6 +160,6 @@ def show(rows: list[Row]) -> None:
             figures = [f"{v:.3g}" if isinstance(v, float) else str(v) for v in map(row.get, numbers)]
             cells += ["reference", *figures[1:]] if row["is_reference"] else figures
         lines.append((cells, row["failure"]))
-    print_table(["", "family", "value", *numbers.values()], lines)
+    print_table(["", "family", "value", *numbers.values()], lines, n_texts=3)
     if any(row["warnings"] for row in rows):
         print("! has warnings, in its report.json and in the column warnings of study.csv")

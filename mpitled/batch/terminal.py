@@ -48,11 +48,14 @@ class Screen:
             self._bars.stop()
 
 
-def print_table(headings: Sequence[str], rows: Sequence[tuple[Sequence[str], str]]) -> None:
-    """Print rows of cells, each with a remark or "" at its end; the parts of a heading "name, unit" are stacked."""
+def print_table(headings: Sequence[str], rows: Sequence[tuple[Sequence[str], str]], *, n_texts: int = 0) -> None:
+    """Print rows of cells, each with a remark or "" at its end; the parts of a heading "name, unit" are stacked.
+
+    The first `n_texts` columns are aligned to the left.
+    """
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for heading in headings:
-        table.add_column(Text(heading.replace(", ", "\n")), justify="right")
+    for i, heading in enumerate(headings):
+        table.add_column(Text(heading.replace(", ", "\n")), justify="left" if i < n_texts else "right")
     if any(remark for _, remark in rows):
         table.add_column()
     for cells, remark in rows:
