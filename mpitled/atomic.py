@@ -1,4 +1,4 @@
-"""Folders, and text files that are there whole or not at all, whenever the program is killed."""
+"""Folders and text files. A text file is complete or absent, even if the program is killed while it writes the file."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from typing import Any
 from mpitled.errors import InputError
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text to a temporary file beside `path`, which then takes its name. InputError if the disc refuses."""
+def write_text(path: Path, text: str | Iterable[str]) -> None:
+    """Write UTF-8 text, at once or in chunks, to a temporary file, then rename the file. InputError if this fails."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     with writing(path):
         try:
             with temporary.open("w", encoding="utf-8", newline="") as file:
-                file.write(text)
+                file.writelines([text] if isinstance(text, str) else text)
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(temporary, path)
         finally:
-            with suppress(OSError):  # which would hide why nothing was written
+            with suppress(OSError):  # an error here would hide the first one
                 temporary.unlink()
 
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """What the disc refuses, as one line that names the file."""
+    """Turn an OSError into an InputError that names the file."""
     try:
         yield
     except OSError as error:
@@ -38,7 +38,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def make_folder(path: Path) -> None:
-    """A folder, unless it is there. InputError if the disc refuses."""
+    """Make a folder if it does not exist. InputError if this fails."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -46,9 +46,9 @@ def make_folder(path: Path) -> None:
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write rows by column as CSV; as `write_text`."""
+    """Write these columns of the rows as CSV, as `write_text` writes text."""
     text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer = csv.DictWriter(text, columns, lineterminator="\n", extrasaction="ignore")
     writer.writeheader()
     writer.writerows(rows)
     write_text(path, text.getvalue())

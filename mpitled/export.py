@@ -1,19 +1,17 @@
-"""A model as decks: Abaqus files of the FE mesh and of the cloud, integration points as CSV, and the scene as TOML.
+"""A model as Abaqus files of the FE mesh and the cloud, integration points as CSV, and the scene as TOML.
 
 Numbers are in SI units and the shortest decimals that are read as the same floats, in the model's order of nodes and
-cells: so what is read back by the scene is the same model, bit for bit. But for a cloud of several materials: the decks
-do not say whose its nodes are, and support domains made from them take nodes of all. The scene says so.
+cells: the exported scene gives the same model, bit for bit. The exception is a cloud of several materials: the files
+do not hold the material of a cloud's node, so that new support domains take nodes of all materials. The scene says so.
 
-Materials are neo-Hookean in the Abaqus files too, but not quite of the same law (see `_LAW`), and their C10 and D1 are
-E and nu but for round-off: the scene has these.
+The materials of the Abaqus files are neo-Hookean, but of a slightly different law (see `_LAW`), and their C10 and D1
+give E and nu up to round-off: the scene has E and nu.
 """
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import store, toml
+from mpitled import atomic, store, toml
 from mpitled.deck import GEOMETRIES
 from mpitled.errors import InputError
 from mpitled.laws import Material, NeoHookean
@@ -29,24 +27,24 @@ from mpitled.model import Model
 from mpitled.readers.meshfile import MAX_ID
 
 FE, EFG, GRID, AREAS, SCENE = "fe.inp", "efg.inp", "integration_points.csv", "surface_areas.csv", "scene.toml"
-#: Sections that the export writes anew: constraints and spheres are in the files, materials go by sets that there are.
+#: Sections that are not copied to the scene: the files hold constraints and spheres, materials are given by cell sets.
 _IN_FILES = ("sphere", "material", "fixed", "displaced")
-#: *ELASTIC would be hypoelastic in a step with NLGEOM, which is farther from what is computed than this.
+#: *ELASTIC would be hypoelastic in a step with NLGEOM: farther from the law of the model than this law.
 _LAW = (
     "** mpitled has the energy mu/2 (I1 - 3) - mu ln J + lambda/2 (J - 1)^2, and Abaqus\n"
     "** C10 (J^(-2/3) I1 - 3) + (J - 1)^2/D1. With C10 = mu/2 and D1 = 2/(lambda + 2 mu/3)\n"
     "** they agree for small strain and where J = 1, and differ in large changes of volume.\n"
 )
 _ROW = 16  # numbers in a line of a set
-_CHUNK = 1 << 16  # lines at once
+_CHUNK = 1 << 16  # lines that are formatted at once
 
 
 def write_abaqus(path: Path, directory: Path) -> list[Path]:
-    """Write the model of a file as decks into the directory; the paths written. InputError if it cannot be."""
+    """Export the model of a file into the directory; the paths written. InputError if Abaqus cannot hold the model."""
     model, scene = store.read_model(path), store.read_scene(path)
     _check_names(path, model)
-    model = _named_materials(model)
-    ids = _numbers(model)
+    model = _with_material_sets(model)
+    ids = _node_numbers(model)
     contents: dict[str, Iterable[str]] = {}
     if model.n_fe_nodes:
         contents[FE] = _fe(model, ids)
@@ -56,27 +54,14 @@ def write_abaqus(path: Path, directory: Path) -> list[Path]:
         if model.surface_areas is not None:
             contents[AREAS] = _areas(model.surface_areas, ids)
     contents[SCENE] = _scene(model, scene, list(contents))
-    written = []
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        for name, lines in contents.items():
-            # Under another name first: a file that is there is whole.
-            temporary = directory / f".{name}.{os.getpid()}"
-            try:
-                with temporary.open("w", encoding="utf-8", newline="\n") as file:
-                    file.writelines(lines)
-                os.replace(temporary, directory / name)
-            finally:
-                with suppress(OSError):  # which would hide why nothing was written
-                    temporary.unlink()
-            written.append(directory / name)
-    except OSError as error:
-        raise InputError(f"{error.filename or directory}: cannot be written ({error.strerror})") from None
-    return written
+    atomic.make_folder(directory)
+    for name, lines in contents.items():
+        atomic.write_text(directory / name, lines)
+    return [directory / name for name in contents]
 
 
 def _check_names(path: Path, model: Model) -> None:
-    """InputError for names of sets that the decks cannot tell apart or hold."""
+    """InputError for names of sets that Abaqus cannot hold, or cannot distinguish."""
     for sets in (model.node_sets, model.cell_sets):
         names: dict[str, str] = {}
         for name in sets:
@@ -87,15 +72,15 @@ def _check_names(path: Path, model: Model) -> None:
                 raise InputError(f"{path}: set {name!r} has a name that Abaqus cannot hold; rename it")
 
 
-def _numbers(model: Model) -> NDArray[np.int64]:
-    """Numbers of the nodes in the decks: their own where no two are the same, else rows."""
+def _node_numbers(model: Model) -> NDArray[np.int64]:
+    """Numbers of the nodes in the files: their own if these are unique and valid, else their rows from 1."""
     ids = model.node_ids
     unique = len(np.unique(ids)) == len(ids) and ids.min() >= 1 and ids.max() <= MAX_ID
     return ids if unique else np.arange(1, len(ids) + 1)
 
 
-def _named_materials(model: Model) -> Model:
-    """The model with cell sets of which each is of one material, and which make up all its cells."""
+def _with_material_sets(model: Model) -> Model:
+    """The model with cell sets that give the cells of each material."""
     sets = dict(model.cell_sets)
     for i, material in enumerate(model.materials):
         cells = np.flatnonzero(model.material == i)
@@ -108,15 +93,15 @@ def _named_materials(model: Model) -> Model:
 
 
 def _sets_of(cells: NDArray[np.int64], sets: dict[str, NDArray[np.int64]]) -> list[str]:
-    """Names of disjoint sets that are just these cells together; none if there are none such."""
-    chosen, left = [], np.zeros(int(cells.max(initial=-1)) + 1, bool)
-    left[cells] = True
-    inside = {name: members for name, members in sets.items() if len(members) and members[-1] < len(left)}
+    """Names of disjoint sets whose union is these cells; empty if there are no such sets."""
+    chosen, remaining = [], np.zeros(int(cells.max(initial=-1)) + 1, bool)
+    remaining[cells] = True
+    inside = {name: members for name, members in sets.items() if len(members) and members[-1] < len(remaining)}
     for name in sorted(inside, key=lambda name: -len(inside[name])):
-        if left[inside[name]].all():
+        if remaining[inside[name]].all():
             chosen.append(name)
-            left[inside[name]] = False
-    return chosen if not left.any() else []
+            remaining[inside[name]] = False
+    return chosen if not remaining.any() else []
 
 
 # --- the decks -----------------------------------------------------------------------------------------------------
@@ -174,27 +159,24 @@ def _rows(numbers: NDArray[np.int64]) -> Iterator[str]:
 def _all_sets(
     keyword: str, sets: dict[str, NDArray[np.int64]], ids: NDArray[np.int64], first: int, stop: int
 ) -> Iterator[str]:
-    """The sets' members among first to stop; sets without any are written where they begin, so that they are kept."""
+    """The members of the sets from node or cell `first` to `stop`; empty sets are written once, in the first file."""
     for name, members in sets.items():
         own = members[(members >= first) & (members < stop)]
         if len(own) or (not len(members) and first == 0):
             yield f"*{keyword}, {keyword}={_quoted(name)}\n"
-            numbers = ids[own]
-            full = len(numbers) // _ROW * _ROW
-            yield from _rows(numbers[:full].reshape(-1, _ROW))
-            if full < len(numbers):
-                yield from _rows(numbers[None, full:])
+            numbers = ids[own].tolist()
+            yield from (", ".join(map(str, numbers[i : i + _ROW])) + "\n" for i in range(0, len(numbers), _ROW))
 
 
 def _boundary(model: Model, ids: NDArray[np.int64], first: int, stop: int) -> Iterator[str]:
-    """What is held, as model data, and what is moved, as a step: by sets where whole sets are, else by nodes."""
+    """Fixed nodes as model data, displaced nodes as a step: by sets where whole sets are prescribed, else by nodes."""
     value = np.full((model.n_nodes, 3), np.nan)
     value.ravel()[model.prescribed_dofs] = model.prescribed_displacements
     value[:first] = np.nan
     value[stop:] = np.nan
-    held: list[str] = []
-    moved: list[str] = []
-    singly: list[list[str]] = []  # of each set whose nodes move differently, so that it is read as that set again
+    fixed: list[str] = []
+    displaced: list[str] = []
+    by_set: list[list[str]] = []  # sets whose nodes have different displacements: a reader finds the set again
     for name, members in sorted(model.node_sets.items(), key=lambda item: -len(item[1])):
         own = members[(members >= first) & (members < stop)]
         rows = []
@@ -204,22 +186,22 @@ def _boundary(model: Model, ids: NDArray[np.int64], first: int, stop: int) -> It
                 continue
             if (values == values[0]).all():
                 line = f"{_quoted(name)}, {direction + 1}, {direction + 1}"
-                (held if values[0] == 0 else moved).append(f"{line}, {values[0].item()!r}\n")
+                (fixed if values[0] == 0 else displaced).append(f"{line}, {values[0].item()!r}\n")
             else:
                 rows += _by_node(ids[own], direction, values)
             value[own, direction] = np.nan
         if rows:
-            singly.append(rows)
+            by_set.append(rows)
     for direction in range(3):
-        left = np.flatnonzero(~np.isnan(value[:, direction]))
-        at = value[left, direction]
-        held += _by_node(ids[left[at == 0]], direction, at[at == 0])
-        moved += _by_node(ids[left[at != 0]], direction, at[at != 0])
-    if held:
-        yield "*BOUNDARY\n" + "".join(line.rpartition(", ")[0] + "\n" for line in held)
-    if moved or singly:
+        nodes = np.flatnonzero(~np.isnan(value[:, direction]))
+        values = value[nodes, direction]
+        fixed += _by_node(ids[nodes[values == 0]], direction, values[values == 0])
+        displaced += _by_node(ids[nodes[values != 0]], direction, values[values != 0])
+    if fixed:
+        yield "*BOUNDARY\n" + "".join(line.rpartition(", ")[0] + "\n" for line in fixed)
+    if displaced or by_set:
         yield "*STEP, NLGEOM=YES\n*STATIC\n"
-        yield from ("*BOUNDARY\n" + "".join(rows) for rows in (moved, *singly) if rows)
+        yield from ("*BOUNDARY\n" + "".join(rows) for rows in (displaced, *by_set) if rows)
         yield "*END STEP\n"
 
 
@@ -242,13 +224,13 @@ def _grid(model: Model) -> Iterator[str]:
 
 def _areas(areas: NDArray[np.float64], ids: NDArray[np.int64]) -> Iterator[str]:
     yield "node,x,y,z\n"
-    there = np.flatnonzero((areas != 0).any(axis=1))
-    for number, (x, y, z) in zip(ids[there].tolist(), areas[there].tolist(), strict=True):
+    nodes = np.flatnonzero((areas != 0).any(axis=1))
+    for number, (x, y, z) in zip(ids[nodes].tolist(), areas[nodes].tolist(), strict=True):
         yield f"{number},{x!r},{y!r},{z!r}\n"
 
 
 def _quoted(name: str) -> str:
-    """A name as Abaqus has it: in quotation marks if it is more than letters, digits and underscores."""
+    """A name for Abaqus: in quotation marks unless it has letters, digits and underscores only."""
     return name if re.fullmatch(r"[A-Za-z_]\w*", name, re.ASCII) else f'"{name}"'
 
 
@@ -256,32 +238,36 @@ def _quoted(name: str) -> str:
 
 
 def _scene(model: Model, scene: dict[str, Any], files: Sequence[str]) -> Iterator[str]:
-    """The deck that the model was built from, with these files in place of its geometry."""
+    """The deck from which the model was built, with these files in place of its geometry."""
     yield "# Written by mpitled export. Fixed and displaced nodes are in the files of [mesh]; rotations are here too.\n"
     if model.figures.cloud_parts > 1:
         yield "# In the model each support domain has nodes of its own material only; made from these files, of any.\n"
-    yield from (f"{key} = {toml.value(value)}\n" for key, value in scene.items() if not isinstance(value, dict | list))
-    yield "\n[mesh]\n"
-    for key, name in (("fe", FE), ("efg", EFG), ("integration_points", GRID), ("surface_areas", AREAS)):
-        if name in files:
-            yield f"{key} = {toml.value(name)}\n"
-    yield 'unit = "m"\nmerge_tolerance = 0.0\n'
+    yield from _keys({key: value for key, value in scene.items() if not isinstance(value, dict | list)})
+    names = {"fe": FE, "efg": EFG, "integration_points": GRID, "surface_areas": AREAS}
+    mesh = {key: name for key, name in names.items() if name in files}
+    yield from _section("[mesh]", mesh | {"unit": "m", "merge_tolerance": 0.0})
     for section, table in scene.items():
         if isinstance(table, dict) and section not in (*GEOMETRIES, "cloud", *_IN_FILES):
-            yield f"\n[{section}]\n"
-            yield from (f"{key} = {toml.value(value)}\n" for key, value in table.items())
+            yield from _section(f"[{section}]", table)
     for entry in scene.get("displaced", ()):
-        if entry["rotation"]:  # the files know where it ends, not that it goes there along an arc
-            yield "\n[[displaced]]\n"
-            yield from (f"{key} = {toml.value(value)}\n" for key, value in entry.items())
+        if entry["rotation"]:  # the files hold the final displacement, not the arc that leads to it
+            yield from _section("[[displaced]]", entry)
     used: set[str] = set()
     for i, material in enumerate(model.materials):
         name = material.name
         while name in used:
             name += "_"
         used.add(name)
-        sets = _sets_of(np.flatnonzero(model.material == i), model.cell_sets)
-        if sets:
-            yield f"\n[material.{toml.value(name)}]\n"
+        if sets := _sets_of(np.flatnonzero(model.material == i), model.cell_sets):
             keys = material.record() | {"cells": sets}
-            yield from (f"{key} = {toml.value(value)}\n" for key, value in keys.items() if key not in ("name", "law"))
+            keys = {key: value for key, value in keys.items() if key not in ("name", "law")}
+            yield from _section(f"[material.{toml.value(name)}]", keys)
+
+
+def _section(heading: str, keys: dict[str, Any]) -> Iterator[str]:
+    yield f"\n{heading}\n"
+    yield from _keys(keys)
+
+
+def _keys(keys: dict[str, Any]) -> Iterator[str]:
+    return (f"{key} = {toml.value(value)}\n" for key, value in keys.items())

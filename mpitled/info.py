@@ -1,7 +1,8 @@
-"""What mpitled works with: versions, what is missing and how to get it; and what a file of its own holds."""
+"""`mpitled info`: versions of the libraries, what is missing and how to install it; the contents of a file."""
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 import platform
 import shutil
@@ -12,22 +13,23 @@ from typing import Any, NamedTuple
 from mpitled import __version__
 from mpitled.errors import InputError, damaged
 
-_MOST_LABELS = 200  # that are shown, a line each
+_MOST_LABELS = 200  # labels that are listed
+_Description = tuple[str, list[tuple[str, str]]]  # heading, and lines of a name and a value
 _SETUP = "bash jobs/brain.sh sets it up, or see jobs/environment.sh"
 
 
 class _Part(NamedTuple):
-    """Something that is needed, or only useful."""
+    """A library or a program."""
 
     name: str
-    version: str | None  # None where it is missing
+    version: str | None  # None: missing
     purpose: str
     remedy: str
     needed: bool = True
 
 
 def table() -> str:
-    """Versions, a line each, then what is missing, what it is for and how to get it."""
+    """The version of each part, then the purpose of each missing part and how to install it."""
     parts = _parts()
     lines = [f"{part.name:<12}{part.version or 'missing'}" for part in parts]
     for part in parts:
@@ -38,53 +40,53 @@ def table() -> str:
 
 
 def complete() -> bool:
-    """Whether nothing is missing that a run on several ranks needs."""
+    """Whether a run on several ranks has all that it needs."""
     return not any(part.needed and part.version is None for part in _parts())
 
 
 def versions() -> dict[str, str | None]:
-    """Version of each part; None where it is missing."""
+    """The version of each part; None if it is missing."""
     return {part.name: part.version for part in _parts()}
 
 
 def contents(path: Path) -> dict[str, Any]:
-    """What a model, result, checkpoint, table or label image is and holds, as JSON can hold it, after it was read.
+    """The kind and contents of a model, result, checkpoint, table or label image, for JSON; all data is read first.
 
-    InputError if it is none of these, or damaged. Of tables, which have no checksums, only the outlines are read.
+    InputError if the file is none of these, or is damaged. Tables have no checksums: only their outlines are read.
     """
     from mpitled.meshing import label_image
 
     path = _file_of(path)
     if label_image.is_image(path):
         return {"kind": "image", "path": str(path), **label_image.contents(path)}
-    if path.is_file() and (what := _elsewhere(path)):
-        raise InputError(f"{path}: {what}")
+    if path.is_file() and (redirection := _redirection(path)):
+        raise InputError(f"{path}: {redirection}")
     with damaged(path, "build the model anew, or run the deck again"):
         return _contents(path)
 
 
 def _file_of(path: Path) -> Path:
-    """A file, or of the folder of a run its result, or where there is none the model."""
+    """The file itself; for the folder of a run its result, or its model if there is no result."""
     if not path.is_dir():
         return path
-    there = (path / name for name in ("result.partial.vtkhdf", "result.vtkhdf", "model.h5"))
-    found = next(filter(Path.exists, there), None)
+    candidates = (path / name for name in ("result.partial.vtkhdf", "result.vtkhdf", "model.h5"))
+    found = next(filter(Path.exists, candidates), None)
     if found is None:
         raise InputError(f"{path}: is a folder without a result or a model; give a file, or the folder of a run")
     return found
 
 
-def _elsewhere(path: Path) -> str:
-    """What a file is that is read by another command or program, by its name, and where to turn; else nothing."""
+def _redirection(path: Path) -> str:
+    """The command or program that reads files with this name, and what they are; "" for files of this command."""
     from mpitled.deck import OF_MESHES
 
     if path.name == "report.json":
         return f"is the report of a run: mpitled report {path.parent}"
-    of_others = {".toml": f"is a deck: mpitled check {path}"}
-    of_others |= dict.fromkeys(OF_MESHES, f"is a mesh: mpitled check {path}")
-    of_others |= dict.fromkeys((".csv", ".md"), "is a table of text; open it in an editor or a spreadsheet")
-    of_others |= dict.fromkeys((".png", ".html"), "is there to be looked at; open it in a viewer or a browser")
-    return of_others.get(path.suffix.lower(), "")
+    kinds = {".toml": f"is a deck: mpitled check {path}"}
+    kinds |= dict.fromkeys(OF_MESHES, f"is a mesh: mpitled check {path}")
+    kinds |= dict.fromkeys((".csv", ".md"), "is a table of text; open it in an editor or a spreadsheet")
+    kinds |= dict.fromkeys((".png", ".html"), "is a picture or a page; open it in a viewer or a browser")
+    return kinds.get(path.suffix.lower(), "")
 
 
 def _contents(path: Path) -> dict[str, Any]:
@@ -96,22 +98,22 @@ def _contents(path: Path) -> dict[str, Any]:
     if tables := store.table_contents(path):
         return {"kind": "table", "path": str(path), "tables": tables}
     if store.is_checkpoint(path):
-        told = store.checkpoint_contents(path)
+        found = store.checkpoint_contents(path)
         names = ("version", "ranks", "step", "share", "frames")
-        return {"kind": "checkpoint", "path": str(path)} | {name: told[name] for name in names}
+        return {"kind": "checkpoint", "path": str(path)} | {name: found[name] for name in names}
     with store.open_result(path) as result:
         result.check()
         metadata, times = result.metadata, result.times
         n_hexahedra, last = len(result.hexahedra), float(times[-1]) if len(times) else 0.0
-        solver = metadata.get("deck", {}).get("solver", {})
-        relaxed = solver.get("method") == "dynamic-relaxation"  # whose times are shares of the load
+        relaxed = metadata.get("deck", {}).get("solver", {}).get("method") == "dynamic-relaxation"
+        reached = {"load_share": last} if relaxed else {"time_s": last, "load_time_s": metadata["load_time_s"]}
         return {
             "kind": "result",
             "path": str(path),
             "complete": result.complete,
             "title": metadata["title"],
             "frames": result.n_frames,
-            **({"load_share": last} if relaxed else {"time_s": last, "load_time_s": metadata["load_time_s"]}),
+            **reached,
             "nodes": len(result.at_nodes("node_id")),
             "hexahedra": n_hexahedra,
             "support_domains": len(result.in_cells("cell_id")) - n_hexahedra,
@@ -121,76 +123,88 @@ def _contents(path: Path) -> dict[str, Any]:
 
 
 def describe(path: Path) -> str:
-    """The same for people to read."""
+    """The contents of a file as text; errors as `contents`."""
     path = _file_of(path)
-    has = contents(path)
-    if has["kind"] == "model":
-        from mpitled import store
+    found = contents(path)
+    heading, rows = _DESCRIPTIONS[found["kind"]](found)
+    return "\n".join([f"{path}: {heading}", *(f"{name:<16} {value}" if name else value for name, value in rows)])
 
-        return f"{path}: a whole model of mpitled\n{store.describe_model(path)}"
-    if has["kind"] == "image":
-        volumes = has["labels_ml"].items()
-        lines = [
-            f"{path}: an image of {len(volumes)} labels",
-            f"voxels           {' x '.join(map(str, has['voxels']))}",
-            f"voxel            {' x '.join(f'{edge:.6g}' for edge in has['voxel_mm'])} mm",
-            "extent           "
-            + ", ".join(f"{axis} {low:.6g} to {high:.6g}" for axis, (low, high) in has["extent_mm"].items())
-            + " mm, to the right, front and top",
-            *(f"label            {label}: {ml:.3f} ml" for label, ml in list(volumes)[:_MOST_LABELS]),
-        ]
-        if len(volumes) > _MOST_LABELS:
-            lines.append(f"{len(volumes) - _MOST_LABELS} more; so many may be intensities, and no labels")
-        return "\n".join(lines)
-    if has["kind"] == "table":
-        lines = [f"{path}: tables of mpitled"]
-        for name, told in has["tables"].items():
-            lines.append(f"{name:<16} {told['rows']} rows of {', '.join(told['columns'])}")
-        return "\n".join(lines)
-    if has["kind"] == "checkpoint":
-        lines = [
-            f"{path}: a whole checkpoint of mpitled {has['version']}",
-            f"step             {has['step']}, {has['share']:.1%} of the run",
-            f"frames           {has['frames']}",
-            f"ranks            {has['ranks']}",
-        ]
-        return "\n".join(lines)
-    if "load_share" in has:
-        reached = f"{has['load_share']:.1%} of the load"
-    else:
-        reached = f"{has['time_s']:g} s of {has['load_time_s']:g} s"
-    lines = [
-        f"{path}: {'a whole' if has['complete'] else 'an unfinished'} result of mpitled",
-        f"title            {has['title']}",
-        f"frames           {has['frames']}, to {reached}",
-        f"nodes            {has['nodes']}",
-        f"hexahedra        {has['hexahedra']}",
-        f"support domains  {has['support_domains']}",
-        f"ranks            {has['ranks']}",
-        f"versions         {', '.join(f'{name} {version}' for name, version in has['versions'].items())}",
+
+def _describe_model(found: dict[str, Any]) -> _Description:
+    from mpitled import store
+
+    return "a whole model of mpitled", [("", store.describe_model(Path(found["path"])))]
+
+
+def _describe_image(found: dict[str, Any]) -> _Description:
+    volumes = found["labels_ml"]
+    extent = ", ".join(f"{axis} {low:.6g} to {high:.6g}" for axis, (low, high) in found["extent_mm"].items())
+    rows = [
+        ("voxels", " x ".join(map(str, found["voxels"]))),
+        ("voxel", f"{' x '.join(f'{edge:.6g}' for edge in found['voxel_mm'])} mm"),
+        ("extent", f"{extent} mm, to the right, front and top"),
+        *(("label", f"{label}: {ml:.3f} ml") for label, ml in list(volumes.items())[:_MOST_LABELS]),
     ]
-    return "\n".join(lines)
+    if len(volumes) > _MOST_LABELS:
+        rows.append(("", f"{len(volumes) - _MOST_LABELS} more; the image may hold intensities, and no labels"))
+    return f"an image of {len(volumes)} labels", rows
+
+
+def _describe_table(found: dict[str, Any]) -> _Description:
+    tables = found["tables"].items()
+    return "tables of mpitled", [(name, f"{of['rows']} rows of {', '.join(of['columns'])}") for name, of in tables]
+
+
+def _describe_checkpoint(found: dict[str, Any]) -> _Description:
+    rows = [("step", f"{found['step']}, {found['share']:.1%} of the run")]
+    rows += [(name, str(found[name])) for name in ("frames", "ranks")]
+    return f"a whole checkpoint of mpitled {found['version']}", rows
+
+
+def _describe_result(found: dict[str, Any]) -> _Description:
+    if "load_share" in found:
+        reached = f"{found['load_share']:.1%} of the load"
+    else:
+        reached = f"{found['time_s']:g} s of {found['load_time_s']:g} s"
+    rows = [("title", found["title"]), ("frames", f"{found['frames']}, to {reached}")]
+    names = ("nodes", "hexahedra", "support_domains", "ranks")
+    rows += [(name.replace("_", " "), str(found[name])) for name in names]
+    rows.append(("versions", ", ".join(f"{name} {version}" for name, version in found["versions"].items())))
+    return f"{'a whole' if found['complete'] else 'an unfinished'} result of mpitled", rows
+
+
+_DESCRIPTIONS: dict[str, Callable[[dict[str, Any]], _Description]] = {
+    "model": _describe_model,
+    "image": _describe_image,
+    "table": _describe_table,
+    "checkpoint": _describe_checkpoint,
+    "result": _describe_result,
+}
 
 
 def _parts() -> list[_Part]:
     def package(name: str, purpose: str, extra: str = "", needed: bool = True) -> _Part:
-        what = f"'mpitled[{extra}]'" if extra else f"'{name}'"
-        return _Part(name, _installed(name), purpose, f"pip install {what}", needed)
+        target = f"'mpitled[{extra}]'" if extra else f"'{name}'"
+        return _Part(name, _installed(name), purpose, f"pip install {target}", needed)
 
     metis = _installed("pymetis")
+    parallel = _reported("mpitled.store", "has_mpi")
+    parallel = {"True": "yes", "False": None}.get(str(parallel), parallel)
     return [
         _Part("mpitled", __version__, "", ""),
         _Part("Python", platform.python_version(), "", ""),
-        _Part("MPI", _asked(_mpi), "more than one rank", _SETUP),
+        _Part("MPI", _reported("mpitled.parallel.halo", "library_version"), "more than one rank", _SETUP),
         _Part("mpirun", shutil.which("mpirun"), "more than one rank", _SETUP),
         package("mpi4py", "more than one rank"),
-        _Part("HDF5", _asked(_hdf5), "every file", _SETUP),
-        _Part("HDF5 + MPI", _asked(_parallel_hdf5), "files of more than one rank (h5py built with MPI)", _SETUP),
+        _Part("HDF5", _reported("mpitled.store", "hdf5_version"), "every file", _SETUP),
+        _Part("HDF5 + MPI", parallel, "files of more than one rank (h5py built with MPI)", _SETUP),
         package("h5py", "every file"),
         _Part("METIS", metis and f"in pymetis {metis}", "more than one rank", "pip install 'pymetis'"),
         package("numba", "the kernels"),
         package("numpy", "everything"),
         package("scipy", "building models"),
+        package("pydantic", "decks"),
+        package("rich", "tables and progress of sweeps"),
         package("meshio", "meshes of other programs"),
         package("nibabel", "label images", "images", needed=False),
         package("matplotlib", "the report's pictures", "pictures", needed=False),
@@ -209,28 +223,10 @@ def _installed(name: str) -> str | None:
         return None
 
 
-def _asked(ask: Callable[[], str | None]) -> str | None:
-    """What a library says of itself; None if it is not there, or cannot be loaded."""
+def _reported(module: str, function: str) -> str | None:
+    """The version that a library reports to a function of ours; None if it is missing, or cannot be loaded."""
     try:
-        return ask()
+        return str(getattr(importlib.import_module(module), function)())
     except (ImportError, OSError, RuntimeError) as error:
         package = (getattr(error, "name", None) or "").partition(".")[0]
-        return None if package in ("", "mpi4py", "h5py") else f"not asked, for {package} is missing"
-
-
-def _mpi() -> str:
-    from mpitled.parallel.halo import library_version
-
-    return library_version()
-
-
-def _hdf5() -> str:
-    from mpitled.store import hdf5_version
-
-    return hdf5_version()
-
-
-def _parallel_hdf5() -> str | None:
-    from mpitled.store import has_mpi
-
-    return "yes" if has_mpi() else None
+        return None if package in ("", "mpi4py", "h5py") else f"unknown, because {package} is missing"

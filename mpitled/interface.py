@@ -1,15 +1,14 @@
-"""The Python interface: decks, models and runs for notebooks, and results that are read as they are asked for.
+"""The Python interface for notebooks: decks, models, runs, and results that are read on access.
 
-Numbers of results are in SI units, those of reports in the units that their keys name.
+Results are in SI units; reports are in the units that their keys name.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -26,14 +25,14 @@ from mpitled.parallel.halo import World
 
 __all__ = ["Frames", "RunResult", "build_model", "load_deck", "open_result", "open_sweep", "run"]
 
-#: More than this is no small thing to hold at once, bytes.
+#: Largest dataset that `to_xarray` reads into memory, bytes.
 _LARGEST = 1 << 30
 
 
 def build_model(deck: Deck | str | Path, overrides: str | Sequence[str] = ()) -> Model:
     """The discrete model of a deck, in memory. InputError if the mesh and the deck do not fit each other.
 
-    Overrides, "section.key=value", are for a deck that is given as a path.
+    Overrides, "section.key=value", apply to a deck that is given as a path.
     """
     return model_build.build(_loaded(deck, overrides))
 
@@ -46,11 +45,10 @@ def run(
     quiet: bool = True,
     resume: bool = False,
 ) -> Any:
-    """Compute a deck into a directory on this process, or on all ranks under mpirun; its report, as report.json has it.
+    """Compute a deck into a directory on this process, or on all ranks under mpirun; the content of report.json.
 
-    With `resume` it goes on from the last checkpoint in the directory, from the start where there is none.
-    Overrides, "section.key=value", are for a deck that is given as a path. InputError, UnstableError or
-    InterruptedRun, alike on all ranks.
+    `resume` continues from the last checkpoint in the directory, if there is one. Overrides, "section.key=value",
+    apply to a deck that is given as a path. InputError, UnstableError or InterruptedRun on all ranks.
     """
     return job.run(_loaded(deck, overrides), Path(directory), World(), quiet=quiet, resume=resume)
 
@@ -59,22 +57,22 @@ def _loaded(deck: Deck | str | Path, overrides: str | Sequence[str]) -> Deck:
     if not isinstance(deck, Deck):
         return load_deck(deck, overrides)
     if overrides:
-        raise InputError("overrides: are for a deck given as a path; give them to load_deck")
+        raise InputError("overrides: apply to a deck given as a path; give them to load_deck")
     return deck
 
 
 def open_result(path: str | Path) -> RunResult:
-    """The result of a run: its folder, or the result.vtkhdf in it. InputError if there is none."""
+    """The result of a run, from its folder or its result.vtkhdf. InputError if there is none."""
     return RunResult(store.open_result(Path(path)))
 
 
 def open_sweep(folder: str | Path) -> list[dict[str, Any]]:
-    """A record for each case of a sweep, as pandas.DataFrame takes them. InputError if the folder holds no sweep."""
-    return records(collect(cases.told(Path(folder))))
+    """A record for each case of a sweep, for pandas.DataFrame. InputError if the folder holds no sweep."""
+    return records(collect(cases.read_record(Path(folder))))
 
 
-class Frames:
-    """An array for each frame, read when it is asked for: `frames[-1]` is the last."""
+class Frames(Sequence[NDArray[Any]]):
+    """An array for each frame, read on access: `frames[-1]` is the last frame."""
 
     def __init__(self, read: Callable[[int], NDArray[Any]], n_frames: int) -> None:
         self._read, self._n_frames = read, n_frames
@@ -84,37 +82,32 @@ class Frames:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of all frames together, (n_frames, ...), as `numpy.stack` makes them; a frame is read for it."""
+        """(n_frames, ...), the shape of all frames in one array; reads the first frame."""
         return (self._n_frames, *self[0].shape)
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Of each frame, one of which is read for it."""
+        """Type of each frame; reads the first frame."""
         return self[0].dtype
 
-    def __getitem__(self, frame: int) -> NDArray[Any]:
+    def __getitem__(self, frame: Any) -> Any:
         if not -self._n_frames <= frame < self._n_frames:
             raise IndexError(f"there are {self._n_frames} frames, and no {frame}")
         return self._read(frame % self._n_frames)
 
-    def __iter__(self) -> Iterator[NDArray[Any]]:
-        return map(self._read, range(self._n_frames))
-
 
 class RunResult:
-    """What a run wrote. Nothing is read before it is asked for; nodes and cells are in the model's order."""
+    """The result of a run, read on access; nodes and cells are in the model's order."""
 
     def __init__(self, result: store.Result) -> None:
         self._open: store.Result | None = result
         self.path = result.path
-        self.complete = result.complete  # whether the run came to its end
+        self.complete = result.complete
 
     def __enter__(self) -> RunResult:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __repr__(self) -> str:
@@ -122,7 +115,7 @@ class RunResult:
         return f"<RunResult {self.path}: {f'{self._result.n_frames} frames' if self._open else 'closed'}{ended}>"
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         if self._open:
             self._open.__exit__()
         self._open = None
@@ -135,7 +128,7 @@ class RunResult:
 
     @property
     def times(self) -> NDArray[np.float64]:
-        """(n_frames,), s; of dynamic relaxation the share of the load."""
+        """(n_frames,), s; for dynamic relaxation the share of the load."""
         return self._result.times
 
     @property
@@ -145,7 +138,7 @@ class RunResult:
 
     @property
     def displacement(self) -> Frames:
-        """(n_nodes, 3), m, in each frame: the field u_h, at EFG nodes too."""
+        """(n_nodes, 3), m, in each frame: the field u_h, at EFG nodes as well."""
         return self._frames(lambda frame: self._result.at_nodes("displacement", frame))
 
     @property
@@ -155,10 +148,10 @@ class RunResult:
 
     @property
     def stress(self) -> Frames:
-        """(n_cells, 6), Pa, in each frame: Cauchy's of hexahedra, then of support domains; xx, yy, zz, xy, yz, xz.
+        """(n_cells, 6), Pa, in each frame: Cauchy stress of hexahedra, then of support domains; xx, yy, zz, xy, yz, xz.
 
-        Of single cells: where Poisson's ratio is near 0.5 their pressures alternate, and means of neighbours tell more.
-        InputError if the run wrote none.
+        Pressures of neighbouring cells alternate (checkerboard) if Poisson's ratio is near 0.5: average over
+        neighbours. InputError if the run wrote no stress.
         """
         if "stress" not in self._result.names("Cell"):
             raise InputError(f"{self.path}: holds no stress; run the deck with output.stress = true")
@@ -166,12 +159,12 @@ class RunResult:
 
     @property
     def history(self) -> dict[str, NDArray[np.float64]]:
-        """Energies (J) and other numbers, (n_frames,), by name, with "time": as pandas.DataFrame takes it."""
+        """Energies (J) and other numbers, (n_frames,), by name, with "time"; for pandas.DataFrame."""
         return {"time": self.times, **self._result.series}
 
     @property
     def report(self) -> dict[str, Any]:
-        """The figures of report.json. InputError if there is none."""
+        """The content of report.json. InputError if there is none."""
         path = self.path.parent / "report.json"
         try:
             return dict(json.loads(path.read_text(encoding="utf-8")))
@@ -181,10 +174,10 @@ class RunResult:
     def to_pyvista(self, frame: int = -1) -> Any:
         """A frame as pyvista.UnstructuredGrid, undeformed, in metres. InputError without PyVista.
 
-        Points are nodes and integration points, with "displacement" (m), the field's. Cells are hexahedra, and vertices
-        for the EFG nodes and, at their integration points, for the support domains: "kind" is 0, 1 and 2 of them. "J",
-        and "stress" (Pa) if the run wrote it, is that of hexahedra and domains, nan of EFG nodes; "material" is the
-        number of their material in the deck, from 0, or -1.
+        Points are nodes and integration points, with the "displacement" (m) of the field. Cells are hexahedra (kind 0),
+        a vertex for each EFG node (kind 1), and a vertex at the integration point of each support domain (kind 2).
+        "J", and "stress" (Pa) if the run wrote it, are nan at EFG nodes; "material" is the number of the material in
+        the deck, from 0, and -1 at EFG nodes.
         """
         try:
             from mpitled.results import solid
@@ -195,7 +188,7 @@ class RunResult:
         return self._frames(lambda frame: solid.frame_grid(self._result, frame))[frame]
 
     def to_xarray(self) -> Any:
-        """All frames as xarray.Dataset. InputError if they are more than a gigabyte."""
+        """All frames as xarray.Dataset. InputError if they are larger than a gigabyte."""
         try:
             import xarray
         except ImportError:

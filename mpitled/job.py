@@ -79,7 +79,7 @@ def run(deck: Deck, directory: Path, world: World, *, quiet: bool = False, resum
     The report, on every rank. InputError, UnstableError or InterruptedRun alike on all ranks.
     """
     with Interrupts(world) as interrupts, ExitStack() as alone:
-        world.on_leader(lambda: alone.enter_context(lock.held(directory, lock.RUN)))
+        world.on_leader(lambda: alone.enter_context(lock.directory_lock(directory, lock.RUN)))
         found = world.on_leader(lambda: _resumable(deck, directory) if resume else _refuse_to_lose(deck, directory))
         if found == DONE:
             if world.leads and not quiet:

@@ -1,4 +1,4 @@
-"""A folder for one process at a time: a lock that ends with the process, on file systems that have locks."""
+"""Locks on folders: one process at a time. The operating system releases a lock when its process ends."""
 
 from __future__ import annotations
 
@@ -12,18 +12,21 @@ from typing import IO
 from mpitled import atomic
 from mpitled.errors import InputError
 
-#: Of what computes into a folder; and of what starts a run there, and records how it ended.
+#: Lock file of a process that computes into a folder, and of one that starts such a process and records its outcome.
 RUN, TASK = ".lock", ".task.lock"
 REMEDY = "is at work there; wait for its end, or give another --out"
 
 
-class Taken(InputError):
-    """Another process is at work in the folder."""
+class LockError(InputError):
+    """Another process holds the lock of the folder."""
 
 
 @contextmanager
-def held(folder: Path, name: str, who: str = "run") -> Iterator[None]:
-    """A folder, made if need be, for this process alone. Taken if another `who` is at work there."""
+def directory_lock(folder: Path, name: str, owner: str = "run") -> Iterator[None]:
+    """Hold the lock `name` of a folder, which is made if need be. LockError if another `owner` holds the lock.
+
+    On a file system without locks the folder is not locked.
+    """
     atomic.make_folder(folder)
     path = folder / name
     while True:
@@ -33,12 +36,12 @@ def held(folder: Path, name: str, who: str = "run") -> Iterator[None]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             file.close()
-            raise Taken(f"{folder}: another {who} {REMEDY}") from None
+            raise LockError(f"{folder}: another {owner} {REMEDY}") from None
         except OSError:
-            break  # there are none here
-        if _is_there(file, path):
+            break  # the file system has no locks
+        if _is_file_at(file, path):
             break
-        file.close()  # who held it has just removed it
+        file.close()  # the previous owner has just removed the file
     try:
         yield
     finally:
@@ -47,8 +50,8 @@ def held(folder: Path, name: str, who: str = "run") -> Iterator[None]:
         file.close()
 
 
-def _is_there(file: IO[str], path: Path) -> bool:
-    """Whether an open file still has its name."""
+def _is_file_at(file: IO[str], path: Path) -> bool:
+    """Whether the path still names this open file."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), path.stat())
     except OSError:

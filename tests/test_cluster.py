@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import os
 import re
 import shutil
@@ -50,33 +49,19 @@ def cluster(folder: Path, script: str, **more: str) -> tuple[list[str], dict[str
     return words, {**ENVIRONMENT, **given, **more}
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """By script: the folder and the output of a job that came to its end, and the seconds that it took."""
-
-    @functools.cache
-    def run(script: str) -> tuple[Path, str, float]:
-        folder = tmp_path_factory.mktemp("job")
-        words, variables = cluster(folder, script)
-        begin = time.monotonic()
-        done = subprocess.run(words, env=variables, capture_output=True, text=True, timeout=120)
-        assert done.returncode == 0, done.stdout + done.stderr
-        return folder, done.stdout, time.monotonic() - begin
-
-    return run
-
-
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_a_job_builds_cuts_and_runs(whole, script):
-    folder, printed, _ = whole(script)
-    assert "2 parts: balance" in printed
-    with open_result(folder / "out" / "scene") as result:
+def test_a_job_builds_partitions_and_runs(tmp_path, script):
+    words, variables = cluster(tmp_path, script)
+    done = subprocess.run(words, env=variables, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "2 parts: balance" in done.stdout
+    with open_result(tmp_path / "out" / "scene") as result:
         assert result.complete
         assert result.metadata["ranks"] == 2
 
 
 def begun(folder: Path) -> bool:
-    """Whether a result can be read already, and not just its file is there."""
+    """Whether the result can be read, not only its file exists."""
     try:
         with open_result(folder):
             return True

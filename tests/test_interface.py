@@ -144,7 +144,7 @@ def test_json_is_what_the_tables_say(result):
     checked = json.loads(mpitled("check", CUBE, "--json", "--set", "block.elements=[3,3,3]").stdout)
     assert (checked["hexahedra"], checked["nodes"]["all"]) == (27, 64)
     assert checked["run"]["loop_s"] == pytest.approx(
-        checked["run"]["steps"] * checked["run"]["step_s"] + checked["run"]["surveys"] * checked["run"]["survey_s"]
+        checked["run"]["steps"] * checked["run"]["step_s"] + checked["run"]["checks"] * checked["run"]["check_s"]
     )
 
 

@@ -11,7 +11,7 @@ from conftest import ROOT, complaint, mpitled
 from scenes import TUMOUR
 
 from mpitled import scaffold
-from mpitled.arguments import KINDS
+from mpitled.commands import KINDS
 from mpitled.deck import canonical, load_deck
 from mpitled.errors import InputError
 from mpitled.model import build as model_build

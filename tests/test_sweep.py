@@ -1,4 +1,4 @@
-"""Sweeps: the same table however it was computed and whenever it was killed, broken cases told, array jobs."""
+"""Sweeps: the same table on processes and on groups of ranks, after a kill, with broken cases, and from array jobs."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -21,8 +22,7 @@ from conftest import ENVIRONMENT, ROOT, complaint, mpitled
 from scenes import TUMOUR, block, pulled
 
 from mpitled import lock, open_sweep
-from mpitled.batch import cases, launch, screen, summary, vary
-from mpitled.batch import sweep as array
+from mpitled.batch import array_job, cases, launch, summary, terminal, vary
 from mpitled.errors import InputError
 from mpitled.store import checkpoint_contents
 
@@ -39,6 +39,18 @@ def groups(tmp_path_factory):
     """The folder of the sweep that two groups of one rank computed, and what they said."""
     out = tmp_path_factory.mktemp("sweep") / "out"
     return out, mpitled(*WORDS, "--out", out, n=2, status=3).stderr
+
+
+def wait_until(condition: Callable[[], object], seconds: float = 120) -> None:
+    deadline = time.time() + seconds
+    while not condition() and time.time() < deadline:
+        time.sleep(0.02)
+
+
+def start(*words: object) -> subprocess.Popen[str]:
+    """The command in a process of its own."""
+    command = [str(Path(sys.executable).with_name("mpitled")), *map(str, words)]
+    return subprocess.Popen(command, env=ENVIRONMENT, cwd=ROOT, stderr=subprocess.DEVNULL, text=True)
 
 
 def at_work(folder: Path) -> list[int]:
@@ -68,18 +80,13 @@ def test_a_sweep_killed_at_work_gives_the_table_that_groups_of_ranks_give(tmp_pa
     assert sum("of 3 done] solver.load_steps=1: broken: unstable" in line for line in ended) == 1
 
     out = tmp_path / "killed"
-    command = [str(Path(sys.executable).with_name("mpitled")), *map(str, WORDS), "--out", str(out)]
-    with subprocess.Popen(command, env=ENVIRONMENT, cwd=ROOT, stderr=subprocess.DEVNULL) as process:
-        deadline = time.time() + 60
-        while not list(out.glob("*/done.json")) and time.time() < deadline:
-            time.sleep(0.02)
+    with start(*WORDS, "--out", out) as process:
+        wait_until(lambda: list(out.glob("*/done.json")))
         process.send_signal(signal.SIGKILL)
     ended = {path: path.stat().st_mtime_ns for path in out.glob("*/done.json")}
     assert 0 < len(ended) < 3
-    deadline = time.time() + 10
-    while at_work(out) and time.time() < deadline:
-        time.sleep(0.02)
-    assert at_work(out) == []  # what it had started ended with it
+    wait_until(lambda: not at_work(out), 10)
+    assert at_work(out) == []  # the processes of the cases ended with it
     mpitled("sweep", out, status=3)
     assert (out / "table.csv").read_bytes() == (by_groups / "table.csv").read_bytes()
     assert all(path.stat().st_mtime_ns == then for path, then in ended.items())
@@ -115,7 +122,7 @@ def test_tables_for_programs_and_for_people(tmp_path, groups):
     assert (again.stdout, again.stderr) == ("", "1 broken; --retry computes them again\n")
 
 
-def test_a_table_says_which_cases_were_warned_of(tmp_path, groups):
+def test_a_table_shows_which_cases_have_warnings(tmp_path, groups, capsys):
     out = shutil.copytree(groups[0], tmp_path / "out")
     sweep = cases.read(out)
     path = sweep.cases[1].folder / "report.json"
@@ -123,29 +130,28 @@ def test_a_table_says_which_cases_were_warned_of(tmp_path, groups):
     path.write_text(json.dumps(made | {"warnings": ["far from rest", "coarse"], "cloud_misfit_mm": 0.75}))
     table = summary.collect(sweep)
     summary.write(sweep, table)
-    words = "warning for solver.load_steps=500: far from rest; coarse"
-    printed = summary.text(table).splitlines()
-    assert [line.split()[1] == "*" for line in printed[-4:-1]] == [False, True, False]
+    line = "warning for solver.load_steps=500: far from rest; coarse"
+    summary.show(table)
+    printed = capsys.readouterr().out.splitlines()
+    assert [row.split()[1] == "*" for row in printed[-4:-1]] == [False, True, False]
     assert "0.750" in printed[-3]
-    assert printed[-1] == words
-    assert (out / "table.md").read_text().endswith(f"\n\n- {words}\n")
-    assert words in (out / "table.html").read_text()
+    assert printed[-1] == line
+    assert (out / "table.md").read_text().endswith(f"\n\n- {line}\n")
     with (out / "table.csv").open() as file:
         assert [row["warnings"] for row in csv.DictReader(file)] == ["", "far from rest; coarse", ""]
     with h5py.File(out / "table.h5") as file:
         assert file["table/warnings"].asstr()[1] == "far from rest; coarse"
     page = (out / "table.html").read_text()
+    assert line in page
     assert re.search(r'<th scope="col" class="number">solver.<wbr>load_steps</th><th scope="col">warned</th>', page)
-    assert '<th scope="col" class="number">largest displacement, mm</th>' in page  # though a case has none
+    assert '<th scope="col" class="number">largest displacement, mm</th>' in page  # also where a case has none
     assert re.search(r'<td colspan="\d+">unstable', page)
 
-    # Of two keys, two of whose cases were warned of the same.
     nu = "material.brain.poissons_ratio"
     rows = [row | {nu: 0.45 + 0.01 * i, "warnings": "coarse"} for i, row in enumerate(table.rows[:2])]
-    table = table._replace(keys=[*table.keys, nu], rows=[*rows, *table.rows[2:]])
-    assert summary.text(table._replace(rows=rows, times=table.times[:2])).splitlines()[-1] == (
+    assert summary.warnings(table._replace(keys=[*table.keys, nu], rows=rows)) == [
         f"warning for solver.load_steps=400 {nu}=0.45, solver.load_steps=500 {nu}=0.46: coarse"
-    )
+    ]
 
 
 def test_charts_show_what_differs_by_names_that_fit(tmp_path, groups, monkeypatch):
@@ -153,29 +159,26 @@ def test_charts_show_what_differs_by_names_that_fit(tmp_path, groups, monkeypatc
 
     from mpitled.results import charts
 
-    def drawn(table: summary.Table) -> tuple[list[str], list[str], list[str]]:
-        figures: list[Figure] = []
-        names: list[str] = []
-        monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: figures.append(self))
-        monkeypatch.setattr(charts, "draw_cost", lambda points, _: names.extend(name for *_, name in points))
-        summary._draw(table, tmp_path)
-        (figure,) = figures
-        labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
-        return [axes.get_ylabel() for axes in figure.axes], labels, names
-
+    figures: list[Figure] = []
+    names: list[str] = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: figures.append(self))
+    monkeypatch.setattr(charts, "draw_cost", lambda points, _: names.extend(name for *_, name in points))
     table = summary.collect(cases.read(groups[0]))
-    rows = [row | {"cloud_misfit_mm": 0.0, "warnings": ""} for row in table.rows]
-    panels, labels, names = drawn(table._replace(rows=rows))
+    nu = "material.brain.poissons_ratio"
+    rows = [row | {"cloud_misfit_mm": 0.0, "warnings": "", nu: 0.45} for row in table.rows]
+    summary._draw(table._replace(rows=rows), tmp_path)
+    panels = [axes.get_ylabel() for axes in figures[0].axes]
     assert "largest displacement, mm" in panels
     assert "misfit of cloud, mm" not in panels  # zero everywhere
-    assert labels == []  # one series
+    assert figures[0].legends == []  # one series
     assert names == ["400", "500"]
-    nu = "material.brain.poissons_ratio"
-    rows = [row | {nu: 0.45} for row in rows]
-    assert drawn(table._replace(keys=[*table.keys, nu], rows=rows))[2][0] == "load_steps=400 poissons_ratio=0.45"
+    summary._draw(table._replace(keys=[*table.keys, nu], rows=rows), tmp_path)
+    assert names[2] == "load_steps=400 poissons_ratio=0.45"
 
 
-def array_job(folder: Path, deck: Path, base: list[str], text: str, scheduler: str) -> tuple[Path, dict[str, str]]:
+def write_array_job(
+    folder: Path, deck: Path, base: list[str], text: str, scheduler: str
+) -> tuple[Path, dict[str, str]]:
     """The script for a sweep into folder/out, and variables with launchers that start what they are given.
 
     The folder stands for a set-up clone: the scripts set up what is missing in the one that they are made in.
@@ -189,7 +192,7 @@ def array_job(folder: Path, deck: Path, base: list[str], text: str, scheduler: s
         (tools / name).chmod(0o755)
     path = os.pathsep.join([str(tools), str(Path(sys.executable).parent), ENVIRONMENT["PATH"]])
     plan = cases.plan(deck, vary.grid([text]), base, 1, folder / "out")
-    return array.array_job(plan, scheduler), ENVIRONMENT | {"PATH": path}
+    return array_job.write(plan, scheduler), ENVIRONMENT | {"PATH": path}
 
 
 def test_an_array_job_computes_each_task_alone(tmp_path, monkeypatch):
@@ -197,7 +200,7 @@ def test_an_array_job_computes_each_task_alone(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     base = ["block.elements=[2,2,2]", "solver.method=dynamic-relaxation"]
     for scheduler, number in (("slurm", "SLURM_ARRAY_TASK_ID"), ("pbs", "PBS_ARRAY_INDEX")):
-        script, variables = array_job(tmp_path, CUBE, base, "solver.load_steps=400,500,600", scheduler)
+        script, variables = write_array_job(tmp_path, CUBE, base, "solver.load_steps=400,500,600", scheduler)
         assert "1-3\n" in script.read_text()
         assert "# 3 cases, each on 1 rank;" in script.read_text()
         assert ("srun --mpi=pmix" in script.read_text()) == (scheduler == "slurm")
@@ -211,40 +214,38 @@ def test_an_array_job_computes_each_task_alone(tmp_path, monkeypatch):
 
 
 def test_an_array_job_fits_its_sweep(tmp_path, monkeypatch):
-    """Number of ranks, logs beside a path's blanks, no script of another plan, and a program that is found."""
+    """Number of ranks, logs in a path with blanks, no script of another plan, and a program that is found."""
     deck, out, spaced = tmp_path / "scene.toml", tmp_path / "out", tmp_path / "my 50% files"
     deck.write_text(GROWTH)
-    words = ["sweep", deck, "--vary", "tumour.volume=150,300"]
-    mpitled(*words, "--out", out, "--scheduler", "pbs")
-    mpitled(*words, "--out", out, "--scheduler", "slurm")
+    words = ["sweep", deck, "--vary", "tumour.volume=150,300", "--out"]
+    for scheduler in ("pbs", "slurm"):
+        mpitled(*words, out, "--scheduler", scheduler)
     assert (out / "pbs.sh").exists()
-    mpitled(*words, "--out", out, "--scheduler", "slurm", "--ranks", 2)
+    mpitled(*words, out, "--scheduler", "slurm", "--ranks", 2)
     assert not (out / "pbs.sh").exists()
     line = complaint(mpitled("sweep", out, "--only", 1, n=4, status=2))
     assert "--only 1: has 2 ranks a case, and 4 started; start as many" in line
-    monkeypatch.setenv("OMPI_COMM_WORLD_SIZE", "1")
-    assert "and 1 started" in complaint(mpitled("sweep", out, "--only", 1, status=2))
-    monkeypatch.delenv("OMPI_COMM_WORLD_SIZE")
+    with monkeypatch.context() as patch:
+        patch.setenv("OMPI_COMM_WORLD_SIZE", "1")
+        assert "and 1 started" in complaint(mpitled("sweep", out, "--only", 1, status=2))
 
-    script = Path(mpitled(*words, "--out", spaced, "--scheduler", "slurm").stdout.strip())
-    log = f"{tmp_path}/my 50%% files/slurm-%A_%a.log"
-    assert f'#SBATCH --output="{log}"' in script.read_text()
-    assert "pbs takes no such path" in complaint(mpitled(*words, "--out", spaced, "--scheduler", "pbs", status=2))
-    # Submitted from any folder, by a shell that knows of no program.
+    script = Path(mpitled(*words, spaced, "--scheduler", "slurm").stdout.strip())
+    assert f'#SBATCH --output="{tmp_path}/my 50%% files/slurm-%A_%a.log"' in script.read_text()
+    assert "pbs takes no such path" in complaint(mpitled(*words, spaced, "--scheduler", "pbs", status=2))
+    # Submitted from any folder, by a shell that does not have the program in its path.
     monkeypatch.chdir(tmp_path)
     plan = cases.plan(deck, vary.grid(["tumour.volume=150"]), [], 1, spaced)
     monkeypatch.setattr(sys, "prefix", str(tmp_path / "none"))
-    lines = [line for line in array.array_job(plan, "slurm").read_text().splitlines() if not line.startswith("#")]
+    lines = [line for line in array_job.write(plan, "slurm").read_text().splitlines() if not line.startswith("#")]
     begin = "\n".join(lines[: lines.index("launch=(srun --mpi=pmix)")])
     shell = ["env", "-i", "PATH=/usr/bin:/bin", "bash", "-c", f"{begin}\ncommand -v mpitled"]
     found = subprocess.run(shell, capture_output=True, text=True, check=True).stdout
     assert found.strip() == str(Path(sys.executable).with_name("mpitled"))
 
 
-def test_a_reason_is_no_rule_of_a_banner(tmp_path):
-    """mpirun frames what it has to say."""
-    words = ["sh", "-c", "echo there are not enough slots; echo; echo ------; exit 1"]
-    process = launch.Process(words, tmp_path)
+def test_the_reason_of_a_failure_is_the_last_line_with_words(tmp_path):
+    """mpirun frames its messages."""
+    process = launch.Process(["sh", "-c", "echo there are not enough slots; echo; echo ------; exit 1"], tmp_path)
     process.ended()
     assert process.failure == "there are not enough slots"
 
@@ -255,18 +256,16 @@ def test_a_task_of_an_array_ends_in_order_before_its_time_is_up(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     deck, out = tmp_path / "scene.toml", tmp_path / "out"
     deck.write_text(GROWTH)
-    script, variables = array_job(tmp_path, deck, ["solver.load_time=50"], "tumour.volume=150", scheduler)
+    script, variables = write_array_job(tmp_path, deck, ["solver.load_time=50"], "tumour.volume=150", scheduler)
     hours, minutes, seconds = map(
         int, re.search(r"(?:time|walltime)=(\d+):(\d+):(\d+)$", script.read_text(), re.M).groups()
     )
     if scheduler == "pbs":
         (clock,) = re.findall(r"RUN_SECONDS:-(\d+)", script.read_text())
         assert int(clock) == 3600 * hours + 60 * minutes + seconds - 120
-    variables |= {"SLURM_ARRAY_TASK_ID": "1", "RUN_SECONDS": "10"}
+    variables |= {"SLURM_ARRAY_TASK_ID": "1", "RUN_SECONDS": "20"}
     with subprocess.Popen([script], env=variables, stderr=subprocess.PIPE, text=True) as process:
-        deadline = time.time() + 60
-        while not list(out.glob("*/result.partial.vtkhdf")) and time.time() < deadline:
-            time.sleep(0.02)
+        wait_until(lambda: list(out.glob("*/result.partial.vtkhdf")))
         time.sleep(0.5)
         if scheduler == "slurm":
             process.send_signal(signal.SIGUSR1)
@@ -281,84 +280,67 @@ def test_a_screen_has_bars_on_a_terminal_alone(monkeypatch):
             return True
 
     log = ["note: 3% of it", " 10%      9 s left  100 steps/s", " 45%      5 s left  100 steps/s", "written"]
-    assert screen.share_done(log) == 0.45
-    assert screen.share_done([]) == 0
-    for terminal in (True, False):
-        stream = Terminal() if terminal else io.StringIO()
+    assert terminal.share_done(log) == 0.45
+    assert terminal.share_done([]) == 0
+    line = f"[1 of 5 done] a=[1,2] {100 * 'long '}"
+    for stream in (Terminal(), io.StringIO()):
         monkeypatch.setattr(sys, "stderr", stream)
-        shown = screen.Screen()
-        shown.show({"a=1": 0.45, "a=2": 0.0}, 3)
-        shown.tell("[1 of 5 done] a=1")
+        screen = terminal.Screen()
+        screen.show({"a=[1,2]": 0.45, "a=2": 0.0}, 3)
+        screen.print(line, "green")
+        screen.show({}, 0)
         said = stream.getvalue()
-        assert ("\033[" in said) == terminal
-        assert (" 45% |" in said) == terminal
-        assert "[1 of 5 done] a=1" in said
-    assert said == "[1 of 5 done] a=1\n"
+        assert ("\033[" in said) == (" 45%" in said) == stream.isatty()
+        assert line in said
+    assert said == f"{line}\n"
 
 
 def test_what_cannot_be_swept_is_said_before_anything_runs(tmp_path):
-    def plan(*texts: str) -> cases.Sweep:
-        return cases.plan(CUBE, vary.grid(texts), [], 1, tmp_path / "out")
+    table, out = tmp_path / "cases.csv", tmp_path / "out"
+    good = "solver.load_steps,solver.tolerance\n5,\n6,0.1\n"
 
-    for texts, word in (
+    def plan(text: str) -> cases.Sweep:
+        table.write_text(text)
+        return cases.plan(CUBE, vary.table(table), [], 1, out)
+
+    for texts, message in (
         (["solver.load_step=1,2"], "did you mean load_steps"),
         (["solver.load_steps"], "key=value"),
         (["a=1,2+b=3"], "as many values"),
         (["solver.load_steps=5", "solver.load_steps=6"], "varied twice"),
         (["solver.load_steps=5,5"], "cases 1 and 2 are the same"),
     ):
-        with pytest.raises(InputError, match=word):
-            plan(*texts)
-    table = tmp_path / "cases.csv"
-    for text, word in (
+        with pytest.raises(InputError, match=message):
+            cases.plan(CUBE, vary.grid(texts), [], 1, out)
+    for text, message in (
         ("", "has no cases"),
-        ("a,a\n1,2\n", "a key twice"),
+        ("a,a\n1,2\n", "line 1: has a key twice"),
         ("a,b\n1\n", "line 2: has 1 values for 2 keys"),
         ("a;b\n1,5;2\n", "line 1: separate by commas, not semicolons"),
-    ):
-        table.write_text(text)
-        with pytest.raises(InputError, match=word):
-            vary.table(table)
-    table.write_text("solver.load_steps,solver.tolerance\n5,\n6,0.1\n")
-    values = vary.table(table)
-    assert values == [{"solver.load_steps": "5"}, {"solver.load_steps": "6", "solver.tolerance": "0.1"}]
-    for text, word in (
         ("# of today\nsolver.load_step\n\n5\n", "line 4: solver.load_step = 5: unknown key; did you mean load_steps"),
         ("solver.load_steps\n5\n#6\n5\n", "line 4: cases 1 and 2 are the same"),
     ):
+        with pytest.raises(InputError, match=f"{table}: {message}"):
+            plan(text)
+    sweep = plan(good)
+    assert [dict(case.values) for case in sweep.cases] == [
+        {"solver.load_steps": "5"}, {"solver.load_steps": "6", "solver.tolerance": "0.1"}
+    ]  # fmt: skip
+    for text, message in (("solver.load_steps\n", "no column solver.tolerance"), (f"x,{good}", "x is no column")):
         table.write_text(text)
-        with pytest.raises(InputError, match=f"{table}: {word}"):
-            cases.plan(CUBE, vary.table(table), [], 1, tmp_path / "out")
-    table.write_text("solver.load_steps,solver.tolerance\n5,\n6,0.1\n")
-    sweep = cases.plan(CUBE, values, [], 1, tmp_path / "out")
-    for text, word in (("solver.load_steps\n", "no column solver.tolerance"), ("x\n", "no column")):
-        table.write_text(text)
-        with pytest.raises(InputError, match=word):
+        with pytest.raises(InputError, match=message):
             summary.collect(sweep, table)
-    assert not (tmp_path / "out").exists()
+    assert not out.exists()
     with pytest.raises(InputError, match="holds no sweep"):
         cases.read(tmp_path)
 
 
 def test_the_longest_cases_are_known_beforehand(tmp_path):
-    brain = ROOT / "jobs" / "brain_tumour.toml"
-    keys = ["labels.element_size=4,3", "tumour.volume=113.1,4188.8"]
-    work = {case.words: case.work for case in cases.plan(brain, vary.grid(keys), [], 1, tmp_path).cases}
-    first, *_, last = sorted(work, key=lambda words: work[words])
-    assert "=4 " in first
-    assert "113.1" in first
-    assert "=3 " in last
-    assert "4188.8" in last
-
-
-def test_two_sweeps_do_not_work_in_one_folder(tmp_path):
-    fcntl = pytest.importorskip("fcntl")
-    shutil.rmtree(tmp_path / "out", ignore_errors=True)
-    (tmp_path / "out").mkdir()
-    with (tmp_path / "out" / ".lock").open("w") as held:
-        fcntl.flock(held, fcntl.LOCK_EX)
-        done = mpitled("sweep", CUBE, "--vary", "solver.load_steps=5", "--out", tmp_path / "out", status=2)
-    assert "another sweep is at work" in done.stderr
+    brain, keys = ROOT / "jobs" / "brain_tumour.toml", ["labels.element_size=4,3", "tumour.volume=113.1,4188.8"]
+    plan = cases.plan(brain, vary.grid(keys), [], 1, tmp_path)
+    first, *_, last = sorted(plan.cases, key=lambda case: case.work)
+    assert list(first.values.values()) == ["4", "113.1"]
+    assert list(last.values.values()) == ["3", "4188.8"]
 
 
 def test_two_processes_do_not_compute_one_case(tmp_path):
@@ -368,11 +350,13 @@ def test_two_processes_do_not_compute_one_case(tmp_path):
     keys = ["block.elements=[2,2,2]", "solver.method=dynamic-relaxation"]
     plan = cases.plan(CUBE, vary.grid(["solver.load_steps=400,500"]), keys, 1, out)
     plan.write_manifest()
+    with lock.directory_lock(out, lock.RUN):
+        assert "another sweep is at work" in complaint(mpitled("sweep", out, status=2))
     busy, free = plan.cases
     for name in (lock.RUN, lock.TASK):
         busy.folder.mkdir(exist_ok=True)
         (busy.folder / "precious").touch()
-        with lock.held(busy.folder, name):
+        with lock.directory_lock(busy.folder, name):
             for words in (["--only", "1"], []):
                 line = complaint(mpitled("sweep", out, *words, status=2))
                 assert f"{busy.folder}: another run is at work there" in line
@@ -381,7 +365,7 @@ def test_two_processes_do_not_compute_one_case(tmp_path):
             complaint(mpitled("sweep", out, n=2, status=2))
         assert free.failure == ""
         shutil.rmtree(free.folder)
-    with lock.held(busy.folder, lock.RUN):
+    with lock.directory_lock(busy.folder, lock.RUN):
         for n in (1, 2):
             line = complaint(mpitled("run", CUBE, "--out", busy.folder, n=n, status=2))
             assert "another run is at work there; wait for its end, or give another --out" in line
@@ -389,12 +373,11 @@ def test_two_processes_do_not_compute_one_case(tmp_path):
     mpitled(*words)
     folder = next(study.glob("as*"))
     (folder / "done.json").unlink()
-    with lock.held(folder, lock.RUN):
+    with lock.directory_lock(folder, lock.RUN):
         assert "another run is at work" in complaint(mpitled(*words, status=2))
     assert (folder / "result.vtkhdf").exists()
 
-    command = [str(Path(sys.executable).with_name("mpitled")), "sweep", str(out), "--only", "1"]
-    twice = [subprocess.Popen(command, env=ENVIRONMENT, cwd=ROOT, stderr=subprocess.DEVNULL) for _ in range(2)]
+    twice = [start("sweep", out, "--only", 1) for _ in range(2)]
     assert sorted(process.wait(60) for process in twice) in ([0, 2], [0, 0])  # or the second finds it done
     assert busy.failure == ""
     assert json.loads((busy.folder / "report.json").read_text())["load_share"] == 1
@@ -431,41 +414,41 @@ def test_a_folder_that_cannot_be_made_is_said_in_a_line(tmp_path, words):
     assert f"{out}: cannot be made" in complaint(mpitled(*command, "--out", out, status=2))
 
 
-def test_another_sweep_does_not_take_the_place_of_a_table(tmp_path):
-    """The same goes on and takes more values in; a study alike."""
+@pytest.mark.parametrize("command", ["sweep", "study"])
+def test_a_table_is_not_replaced_by_another_one(tmp_path, command):
+    """The same command resumes, and may add values."""
     deck, out = tmp_path / "scene.toml", tmp_path / "out"
     text = f"{block((20, 20, 20), (2, 2, 2))}{pulled(0.1)}"
     deck.write_text(text)
     nu = "material.brain.poissons_ratio"
-    for command, table in (("sweep", "table.csv"), ("study", "study.csv")):
-        words = [command, deck, "--out", out / command, "--set", "solver.load_steps=60"]
-        for values in ("0.3,0.4", "0.3,0.4", "0.45,0.4,0.3"):
-            mpitled(*words, "--vary", f"{nu}={values}")
-        kept = (out / command / table).read_bytes()
-        for others, why in (
-            ([*words, "--vary", f"{nu}=0.3,0.45"], f"with {nu}=0.4;"),
-            ([*words, "--vary", "hexahedra.hourglass=0.01"], f"over {nu};"),
-            ([*words, "--set", "solver.tolerance=0.1", "--vary", f"{nu}=0.3"], "with --set solver.load_steps=60;"),
-        ):
-            line = complaint(mpitled(*others, status=2))
-            assert f"holds the table of another {command}, {why}" in line
-            assert f"remove {out / command / command}.json to replace it" in line
-        deck.write_text(text.replace("3000", "4000"))
-        line = complaint(mpitled(*words, "--vary", f"{nu}=0.3,0.4,0.45", status=2))
-        assert "of the deck before it or a file that it reads was changed" in line
-        if command == "sweep":  # which can still be read
-            assert "was changed since" in complaint(mpitled("sweep", out / "sweep", status=2))
-            for change in (lambda: None, deck.unlink):
-                change()
-                done = mpitled("report", out / "sweep")
-                assert f"note: {out / 'sweep'}: {deck}, or a file that it reads, is not what was swept" in done.stderr
-                assert (out / command / table).read_bytes() == kept
-                assert [row[nu] for row in open_sweep(out / "sweep")] == [0.45, 0.4, 0.3]
-        deck.write_text(text)
-        assert (out / command / table).read_bytes() == kept
-        (out / command / f"{command}.json").unlink()
-        mpitled(*words, "--vary", f"{nu}=0.3")
-        assert (out / command / table).read_bytes().count(b"\n") < kept.count(b"\n")
+    words = [command, deck, "--out", out, "--set", "solver.load_steps=60"]
+    for values in ("0.3,0.4", "0.3,0.4", "0.45,0.4,0.3"):
+        mpitled(*words, "--vary", f"{nu}={values}")
+    table = out / {"sweep": "table.csv", "study": "study.csv"}[command]
+    kept = table.read_bytes()
+    for others, why in (
+        ([*words, "--vary", f"{nu}=0.3,0.45"], f"with {nu}=0.4;"),
+        ([*words, "--vary", "hexahedra.hourglass=0.01"], f"over {nu};"),
+        ([*words, "--set", "solver.tolerance=0.1", "--vary", f"{nu}=0.3"], "with --set solver.load_steps=60;"),
+    ):
+        line = complaint(mpitled(*others, status=2))
+        assert f"holds the table of another {command}, {why}" in line
+        assert f"remove {out / command}.json to replace it" in line
+    deck.write_text(text.replace("3000", "4000"))
+    line = complaint(mpitled(*words, "--vary", f"{nu}=0.3,0.4,0.45", status=2))
+    assert "of the deck before it or a file that it reads was changed" in line
+    if command == "sweep":  # its table can still be read
+        assert "was changed since" in complaint(mpitled("sweep", out, status=2))
+        for change in (lambda: None, deck.unlink):
+            change()
+            note = f"note: {out}: {deck}, or a file that it reads, is not what was swept"
+            assert note in mpitled("report", out).stderr
+            assert [row[nu] for row in open_sweep(out)] == [0.45, 0.4, 0.3]
+    assert table.read_bytes() == kept
+    deck.write_text(text)
+    (out / f"{command}.json").unlink()
+    mpitled(*words, "--vary", f"{nu}=0.3")
+    assert table.read_bytes().count(b"\n") < kept.count(b"\n")
 
 
 GROWTH = f"""{TUMOUR}
@@ -511,28 +494,24 @@ def test_one_growth_passes_through_what_runs_of_their_own_find(tmp_path):
     assert told[20000.0] == told[33000.0]
 
 
-def test_one_growth_is_for_slow_loading_to_volumes(tmp_path):
-    deck = tmp_path / "scene.toml"
+@pytest.mark.parametrize(("words", "reason"), [
+    (["--vary", "cloud.growth=0.3,0.4"], "tumour.volume alone"),
+    (["--vary", "tumour.volume=100,200", "--set", "solver.method=dynamic"], "not near rest"),
+    (["--vary", "tumour.volume=100,200", "--scheduler", "slurm"], "no array of jobs"),
+])  # fmt: skip
+def test_one_growth_is_for_slow_loading_to_volumes(tmp_path, words, reason):
+    deck, out = tmp_path / "scene.toml", tmp_path / "out"
     deck.write_text(GROWTH)
-    for words, reason in (
-        (["--vary", "cloud.growth=0.3,0.4"], "tumour.volume alone"),
-        (["--vary", "tumour.volume=100,200", "--set", "solver.method=dynamic"], "not near rest"),
-        (["--vary", "tumour.volume=100,200", "--scheduler", "slurm"], "no array of jobs"),
-    ):
-        done = mpitled("sweep", deck, *words, "--one-growth", "--out", tmp_path / "out", status=2)
-        assert reason in complaint(done)
-    assert not (tmp_path / "out").exists()
+    assert reason in complaint(mpitled("sweep", deck, *words, "--one-growth", "--out", out, status=2))
+    assert not out.exists()
 
 
 def test_an_interrupted_case_goes_on_from_its_checkpoint(tmp_path):
     deck, out = tmp_path / "scene.toml", tmp_path / "out"
     deck.write_text(GROWTH)
     words = ["sweep", deck, "--vary", "tumour.volume=150", "--set", "solver.load_time=5", "--out", out]
-    command = [str(Path(sys.executable).with_name("mpitled")), *map(str, words)]
-    with subprocess.Popen(command, env=ENVIRONMENT, cwd=ROOT, stderr=subprocess.DEVNULL) as process:
-        deadline = time.time() + 60
-        while not list(out.glob("*/result.partial.vtkhdf")) and time.time() < deadline:
-            time.sleep(0.02)
+    with start(*words) as process:
+        wait_until(lambda: list(out.glob("*/result.partial.vtkhdf")))
         time.sleep(0.5)
         process.send_signal(signal.SIGTERM)
     assert process.returncode == 4

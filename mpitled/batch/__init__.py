@@ -1,1 +1,1 @@
-"""Commands that run many decks: sweep, study, stability."""
+"""Commands that run many decks: sweeps and studies."""

@@ -1,4 +1,4 @@
-"""A run of a deck as a process of its own, or as ranks of their own: what studies and sweeps are made of."""
+"""Runs of decks in processes of their own, and how they ended: the basis of sweeps and studies."""
 
 from __future__ import annotations
 
@@ -16,22 +16,20 @@ from pathlib import Path
 
 from mpitled import atomic, lock
 
-#: Says in a run's folder that it ended, and how.
-DONE = "done.json"
-#: What a run says, in its folder.
-LOG = "run.log"
-_DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG of Linux's prctl
+#: Record of the end of a run, and its log, in the folder of the run.
+DONE, LOG = "done.json", "run.log"
+_PR_SET_PDEATHSIG = 1  # of Linux's prctl
 
 
 def ranked(ranks: int) -> list[str]:
-    """The words that start so many ranks; none for one."""
+    """The launcher and its arguments for several ranks; none for one rank."""
     return ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(ranks)] if ranks > 1 else []
 
 
 def command(
     verb: str, deck: Path, overrides: Sequence[str], ranks: int, folder: Path, resume: bool = False
 ) -> list[str]:
-    """What runs or builds (verb) a deck with overrides ("section.key=value") into a folder, or goes on with a run."""
+    """The command that runs or builds (verb) a deck with overrides "section.key=value" into a folder."""
     words = [sys.executable, "-m", "mpitled", verb, str(deck), "--out", str(folder)]
     words += [word for override in overrides for word in ("--set", override)]
     if verb == "build":
@@ -40,24 +38,27 @@ def command(
 
 
 class Process:
-    """A command at work in a folder of its own, where the log is what it says. It ends when this process is killed."""
+    """A process that writes its log into a folder. The process ends when its parent is killed."""
 
-    def __init__(self, words: Sequence[str], folder: Path, longest: int | None = None) -> None:
-        """In a folder that is there. Computing for longer (s) than that, it is killed."""
+    def __init__(self, words: Sequence[str], folder: Path, cpu_limit: int | None = None) -> None:
+        """Start a command for an existing folder; the process is killed after `cpu_limit` seconds of CPU time."""
         self.folder = folder
-        # mpirun takes its ranks along when it is asked to end, and only then.
-        last = signal.SIGTERM if words[0] == "mpirun" else signal.SIGKILL
+        # mpirun ends its ranks on SIGTERM, and cannot do so on SIGKILL.
+        death_signal = signal.SIGTERM if words[0] == "mpirun" else signal.SIGKILL
+
+        def in_child() -> None:
+            if sys.platform == "linux":
+                ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, death_signal)
+            if cpu_limit is not None:
+                resource.setrlimit(resource.RLIMIT_CPU, (cpu_limit, cpu_limit + 1))
+
         with atomic.writing(folder / LOG), (folder / LOG).open("wb") as log:
             self._process = subprocess.Popen(
-                words,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                preexec_fn=lambda: _prepare(last, longest),
+                words, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, preexec_fn=in_child
             )
 
     def ended(self, seconds: float | None = None) -> bool:
-        """Whether it ended, now or (None: however long it takes) within so many seconds."""
+        """Whether the process ended within so many seconds; None: wait for its end."""
         try:
             self._process.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -66,50 +67,41 @@ class Process:
 
     @property
     def status(self) -> int:
-        """Its exit status, or minus the signal that killed it. It has to have ended."""
+        """Exit status of the ended process, or minus the number of the signal that killed it."""
         return int(self._process.returncode)
 
     @property
     def failure(self) -> str:
-        """Why it failed; "" if it did not. It has to have ended."""
-        status = self._process.returncode
-        if status == 0:
+        """Why the ended process failed; "" if it succeeded."""
+        if self.status == 0:
             return ""
-        lines = [line for line in said(self.folder) if any(map(str.isalpha, line))]  # mpirun draws rules too
-        named = [line.removeprefix("mpitled: ") for line in lines if line.startswith("mpitled: ")]
-        if status < 0 and not named:
-            killed = f"killed by {signal.Signals(-status).name}"
-            if status == -signal.SIGXCPU:
-                return f"{killed}: it was not done in the time that it may compute for"
-            return killed + (": perhaps the memory was not enough" if status == -signal.SIGKILL else "")
-        return (named or lines or ["no reason given"])[-1]
+        lines = [line for line in log_lines(self.folder) if any(map(str.isalpha, line))]  # no rules of mpirun
+        messages = [line.removeprefix("mpitled: ") for line in lines if line.startswith("mpitled: ")]
+        if self.status < 0 and not messages:
+            killed = f"killed by {signal.Signals(-self.status).name}"
+            if self.status == -signal.SIGXCPU:
+                return f"{killed}: the limit of CPU time was reached"
+            return killed + (": perhaps the memory was not enough" if self.status == -signal.SIGKILL else "")
+        return (messages or lines or ["no reason given"])[-1]
 
     def stop(self) -> None:
-        """End it, as a person would who wants to keep what it wrote."""
+        """Interrupt the process, which writes a checkpoint, and wait for its end."""
         self._process.terminate()
         self._process.wait()
 
 
-def _prepare(last: int, longest: int | None) -> None:
-    """In the process to be: the signal that ends it with its parent, and the time that it may compute for."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, last)
-    if longest is not None:
-        resource.setrlimit(resource.RLIMIT_CPU, (longest, longest + 1))
-
-
-def said(folder: Path) -> list[str]:
+def log_lines(folder: Path) -> list[str]:
     """The lines of a run's log."""
     log = folder / LOG
     return log.read_text(errors="replace").splitlines() if log.exists() else []
 
 
 def prepare(folder: Path, model: Path | None = None) -> None:
-    """An empty folder for a run, with a model that is there already: it is not built if it is the deck's.
+    """Empty a folder for a run, except for locks, and link a model file into it. LockError if a run is at work there.
 
-    lock.Taken if a run is at work there; only locks are left.
+    The run uses the model if the model is that of its deck.
     """
-    with lock.held(folder, lock.RUN):
+    with lock.directory_lock(folder, lock.RUN):
         for path in folder.iterdir():
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path, ignore_errors=True)
@@ -119,35 +111,35 @@ def prepare(folder: Path, model: Path | None = None) -> None:
         if model and model.exists():
             try:
                 os.link(model, folder / model.name)
-            except OSError:  # not every file system has links
+            except OSError:  # the file system has no hard links
                 with atomic.writing(folder / model.name):
                     shutil.copyfile(model, folder / model.name)
 
 
 def record(folder: Path, failure: str, **more: str) -> None:
-    """Say in a run's folder that it ended: the reason of its failure, "" if it is done."""
+    """Record in its folder that a run ended, and the reason of its failure or ""."""
     atomic.write_text(folder / DONE, json.dumps({"failure": failure, **more}))
 
 
-def run_apart(deck: Path, overrides: Sequence[str], ranks: int, folder: Path, longest: int | None = None) -> str:
-    """Compute a deck in its folder, emptied before; the reason of its failure, "" if it is done.
+def run_apart(deck: Path, overrides: Sequence[str], ranks: int, folder: Path, cpu_limit: int | None = None) -> str:
+    """Run a deck in its folder, which is emptied first; the reason of its failure, or "".
 
-    If it computes for longer (s) than that it is killed. lock.Taken if another is at work there.
+    The run is killed after `cpu_limit` seconds of CPU time. LockError if another process is at work in the folder.
     """
-    with lock.held(folder, lock.TASK):
+    with lock.directory_lock(folder, lock.TASK):
         prepare(folder)
-        process = Process(command("run", deck, overrides, ranks, folder), folder, longest)
+        process = Process(command("run", deck, overrides, ranks, folder), folder, cpu_limit)
         process.ended()
         record(folder, process.failure, status=str(process.status))
         return process.failure
 
 
 def about(folder: Path) -> dict[str, str]:
-    """What was recorded when the run in a folder ended; empty if it did not."""
+    """What was recorded at the end of the run in a folder; empty if no run has ended there."""
     done = folder / DONE
     return dict(json.loads(done.read_text())) if done.exists() else {}
 
 
 def outcome(folder: Path) -> str | None:
-    """How a run ended in its folder: None if it did not, the reason of its failure, or "" for success."""
+    """How the run in a folder ended: None if it has not ended, the reason of its failure, or "" for success."""
     return about(folder).get("failure")

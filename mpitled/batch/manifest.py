@@ -1,11 +1,11 @@
-"""What a sweep or a study says of itself in its folder, so that no other takes the place of its table unasked."""
+"""The manifest of a sweep or a study: a JSON file beside its table that names the deck, the overrides and the cases."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from pydantic import AfterValidator, BaseModel, Field
 
 from mpitled import atomic
 from mpitled.batch import launch
@@ -13,46 +13,70 @@ from mpitled.errors import InputError
 from mpitled.job import MODEL
 
 
-def claim(path: Path, manifest: Mapping[str, Any]) -> None:
-    """Write a manifest, whose "cases" each have a "folder" beside it and "values" by key.
+def _last_part(path: str) -> str:
+    """The last part of a path: a manifest cannot lead out of its own folder."""
+    if (name := Path(path).name) in ("", ".."):
+        raise ValueError("not the name of a folder")
+    return name
 
-    InputError if another one is there, and a case of it that is done is none of these: the same cases go on, and more
-    may be added to them. InputError as well if the folder is a run's, which its table would hide.
+
+class ManifestCase(BaseModel):
+    """One case: its number from 1, its folder beside the manifest, and the values of the varied keys."""
+
+    number: int | None = None
+    folder: Annotated[str, AfterValidator(_last_part)]
+    values: dict[str, str]
+
+
+class Manifest(BaseModel):
+    """The content of the file. A study has no title, ranks and growth of its own."""
+
+    deck: str
+    title: str | None = None
+    overrides: list[str]
+    ranks: Annotated[int, Field(strict=True, ge=1)] | None = None
+    one_growth: Annotated[bool, Field(strict=True)] | None = None
+    cases: Annotated[list[ManifestCase], Field(min_length=1)]
+
+
+def write(path: Path, manifest: Manifest) -> None:
+    """Write a manifest. Cases may be added to the manifest that is there.
+
+    InputError if the earlier manifest has a completed case that the new one lacks, or if the folder is that of a run.
     """
     if (path.parent / MODEL).exists():
         raise InputError(f"{path.parent}: is the folder of a run; give another --out")
-    if other := _other(path, manifest):
+    if difference := _difference(path, manifest):
         raise InputError(
-            f"{path.parent}: holds the table of another {path.stem}, {other}; give another --out, or remove {path} to "
-            "replace it"
+            f"{path.parent}: holds the table of another {path.stem}, {difference}; give another --out, or remove "
+            f"{path} to replace it"
         )
     atomic.make_folder(path.parent)
-    atomic.write_text(path, json.dumps(manifest, indent=2) + "\n")
+    atomic.write_text(path, manifest.model_dump_json(indent=2, exclude_none=True) + "\n")
 
 
-def _other(path: Path, manifest: Mapping[str, Any]) -> str:
-    """How the one that is there differs from a manifest that would lose a case of it; "" if none is lost."""
-    ours = {case["folder"] for case in manifest["cases"]}
+def _difference(path: Path, new: Manifest) -> str:
+    """How the earlier manifest differs from the new one; "" if no completed case would be lost."""
     try:
-        old = json.loads(path.read_text(encoding="utf-8"))
-        lost = [case for case in old["cases"] if case["folder"] not in ours]
-        lost = [case for case in lost if launch.outcome(path.parent / Path(case["folder"]).name) == ""]
-        if not lost:
-            return ""
-        values = {str(key): str(value) for key, value in lost[0]["values"].items()}
-        for name, words in (
-            ("deck", f"of {old['deck']}"),
-            ("overrides", f"with {' '.join(f'--set {word}' for word in old['overrides']) or 'no --set'}"),
-            ("ranks", f"on so many ranks a case: {old.get('ranks')}"),
-            ("one_growth", f"{'of' if old.get('one_growth') else 'not of'} one growth"),
-        ):
-            if old.get(name) != json.loads(json.dumps(manifest.get(name))):
-                return words
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return ""  # of no use to anybody
-    here = [case["values"] for case in manifest["cases"]]
-    if values in here:
+        old = Manifest.model_validate_json(path.read_bytes())
+        folders = {case.folder for case in new.cases}
+        lost = [case for case in old.cases if case.folder not in folders]
+        lost = [case for case in lost if launch.outcome(path.parent / case.folder) == ""]
+    except (OSError, ValueError):
+        return ""  # the earlier manifest cannot be used
+    if not lost:
+        return ""
+    if old.deck != new.deck:
+        return f"of {old.deck}"
+    if old.overrides != new.overrides:
+        return f"with {' '.join(f'--set {override}' for override in old.overrides) or 'no --set'}"
+    if old.ranks != new.ranks:
+        return f"with --ranks {old.ranks}"
+    if old.one_growth != new.one_growth:
+        return f"{'with' if old.one_growth else 'without'} --one-growth"
+    values = lost[0].values
+    if any(values == case.values for case in new.cases):
         return "of the deck before it or a file that it reads was changed"
-    if set(values) not in [set(given) for given in here]:
+    if all(values.keys() != case.values.keys() for case in new.cases):
         return f"over {' and '.join(values) or 'nothing'}"
     return f"with {' '.join(f'{key}={value}' for key, value in values.items())}"

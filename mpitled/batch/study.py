@@ -1,4 +1,4 @@
-"""The study of a scene: error against run time over the keys that trade one for the other, a process for each run."""
+"""The study of a scene: error against run time over keys that trade one for the other, each run in a process."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from mpitled import atomic
-from mpitled.batch import launch, manifest
-from mpitled.batch import vary as families
+from mpitled.batch import launch, manifest, vary
+from mpitled.batch.manifest import Manifest, ManifestCase
+from mpitled.batch.terminal import print_table
 from mpitled.deck import Deck, load_deck, scene_key
 from mpitled.errors import InputError
 from mpitled.job import included
@@ -23,63 +24,62 @@ COLUMNS = (
     "family", "value", "ranks", "max_error_mm", "rms_error_mm", "cloud_misfit_mm", "static_distance_mm", "loop_s",
     "whole_s", "steps", "cells", "cell_updates", "pareto", "is_reference", "warnings", "failure",
 )  # fmt: skip
+Row = dict[str, Any]  # by column; "" where there is no value
 
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One run: the deck with the overrides of one value of a family, on so many ranks."""
+    """One run: the deck with one value of a family, on a number of ranks."""
 
     family: str  # the varied key, or "as it is"
     value: str
-    overrides: tuple[str, ...]
+    overrides: Sequence[str]  # of this run only
     ranks: int
 
     def folder(self, scene: Deck) -> str:
-        """A name that a person can read, and that no other variant has, nor this one of a deck that was changed."""
-        key = scene_key(scene, included(scene))
-        return families.folder(f"{self.family}-{self.value}", json.dumps([self.ranks, key]))
+        """A readable name that is unique for the number of ranks and the content of the scene and its files."""
+        content = json.dumps([self.ranks, scene_key(scene, included(scene))])
+        return vary.folder_name(f"{self.family}-{self.value}", content)
 
 
-def variants(vary: Sequence[str], base: Sequence[str]) -> Iterator[Variant]:
-    """The scene as it is, then each family in turn (see `vary.family`); the key "ranks" is the number of ranks."""
-    yield Variant("as it is", "", tuple(base), 1)
-    for text in vary:
-        for values in families.family(text):
-            ranks = values.get("ranks", "1")
+def variants(families: Sequence[str]) -> Iterator[Variant]:
+    """The scene as it is, then each family in turn (`vary.family`); the key "ranks" is the number of ranks."""
+    yield Variant("as it is", "", (), 1)
+    for text in families:
+        for values in vary.family(text):
+            family, value, ranks = "+".join(values), " ".join(values.values()), values.pop("ranks", "1")
             if not ranks.isdecimal() or int(ranks) < 1:
                 raise InputError(f"--vary {text}: ranks = {ranks}: is not a number of ranks; give 1 or more")
-            keys = {key: value for key, value in values.items() if key != "ranks"}
-            yield Variant("+".join(values), " ".join(values.values()), families.overrides(base, keys), int(ranks))
+            yield Variant(family, value, values.overrides, int(ranks))
 
 
 def study(
     deck: Path,
     reference: Path | None,
-    vary: Sequence[str],
-    base: Sequence[str],
+    families: Sequence[str],
+    overrides: Sequence[str],
     out: Path,
     beyond: float | None,
     quiet: bool = False,
-) -> list[dict[str, Any]]:
-    """Run what has not been run yet, one after the other, and tell what all of them gave: study.csv and study.png.
+) -> list[Row]:
+    """Run the variants that have not been run, one after the other; a row of figures each, also as study.csv and .png.
 
-    Errors (mm) are against the reference beyond so far (m) from edges, or, without one, against the run of most cell
-    updates: how near a run is to rest says nothing of its mesh. InputError for keys and values that the deck does not
-    take, and for a folder that holds another study, before anything runs.
+    Errors (mm) are against the reference, at points farther than `beyond` (m) from prescribed edges. Without a
+    reference they are differences from the run of most cell updates: a small distance from rest does not show the
+    error of the mesh. InputError for keys and values that the deck does not accept, and for a folder that holds
+    another study, before anything runs.
     """
-    todo = list(variants(vary, base))
-    folders = [out / variant.folder(load_deck(deck, base, variant.overrides[len(base) :])) for variant in todo]
-    cases = [
-        {"folder": folder.name, "values": {variant.family: variant.value}}
-        for variant, folder in zip(todo, folders, strict=True)
-    ]
-    manifest.claim(out / MANIFEST, {"deck": str(deck.resolve()), "overrides": list(base), "cases": cases})
+    todo = list(variants(families))
+    folders = [out / variant.folder(load_deck(deck, overrides, variant.overrides)) for variant in todo]
+    runs = list(zip(todo, folders, strict=True))
+    cases = [ManifestCase(folder=folder.name, values={variant.family: variant.value}) for variant, folder in runs]
+    manifest.write(out / MANIFEST, Manifest(deck=str(deck.resolve()), overrides=list(overrides), cases=cases))
     rows = []
-    for i, (variant, folder) in enumerate(zip(todo, folders, strict=True), 1):
+    for i, (variant, folder) in enumerate(runs, 1):
         if (failure := launch.outcome(folder)) is None:
             if not quiet:
                 print(f"{i}/{len(todo)}: {variant.family} {variant.value}".rstrip(), file=sys.stderr, flush=True)
-            failure = launch.run_apart(deck, variant.overrides, variant.ranks, folder)
+            failure = launch.run_apart(deck, (*overrides, *variant.overrides), variant.ranks, folder)
         rows.append(_row(variant, failure, folder))
     done = [(row, folder) for row, folder in zip(rows, folders, strict=True) if not row["failure"]]
     if reference is None and done:
@@ -91,23 +91,27 @@ def study(
             found = groups["free beyond" if beyond is not None else "free"]
             row |= {"max_error_mm": found["largest_mm"][-1], "rms_error_mm": found["rms_mm"][-1]}
     for row in rows:
-        row["pareto"] = _is_best(row, rows)
+        row["pareto"] = _is_pareto(row, rows)
     atomic.write_csv(out / "study.csv", COLUMNS, rows)
-    if not any(row["max_error_mm"] for row in rows):  # of runs that failed, or of one alone
-        print(f"{out}: no picture, for there are no errors to draw", file=sys.stderr)
-        return rows
-    try:
-        from mpitled.results import charts
-    except ImportError:
-        print(f"{out}: no picture, for matplotlib is missing", file=sys.stderr)
-    else:
-        with atomic.writing(out / "study.png"):
-            charts.draw_study(rows, out / "study.png", f"largest {_named(rows)}, mm")
+    _draw(rows, out)
     return rows
 
 
-def _row(variant: Variant, failure: str, folder: Path) -> dict[str, Any]:
-    row: dict[str, Any] = dict.fromkeys(COLUMNS, "")
+def _draw(rows: list[Row], out: Path) -> None:
+    if not any(row["max_error_mm"] for row in rows):  # all runs failed, or there is one run only
+        print(f"{out}: no picture, because there are no errors to draw", file=sys.stderr)
+        return
+    try:
+        from mpitled.results import charts
+    except ImportError:
+        print(f"{out}: no picture, because matplotlib is missing", file=sys.stderr)
+        return
+    with atomic.writing(out / "study.png"):
+        charts.draw_study(rows, out / "study.png", f"largest {_quantity(rows)}, mm")
+
+
+def _row(variant: Variant, failure: str, folder: Path) -> Row:
+    row: Row = dict.fromkeys(COLUMNS, "")
     row |= {"family": variant.family, "value": variant.value, "ranks": variant.ranks, "failure": failure}
     if failure:
         return row
@@ -125,45 +129,37 @@ def _row(variant: Variant, failure: str, folder: Path) -> dict[str, Any]:
     }
 
 
-def _named(rows: list[dict[str, Any]]) -> str:
-    """What the errors are: without a reference they are not known, but how far runs are from the one of most work."""
+def _quantity(rows: list[Row]) -> str:
+    """Whether the rows have errors against a reference, or differences from one of the runs."""
     return "difference" if any(row["is_reference"] for row in rows) else "error"
 
 
-def _is_best(row: dict[str, Any], rows: list[dict[str, Any]]) -> bool:
-    """Whether no other run is both more accurate and faster (Pareto)."""
+def _is_pareto(row: Row, rows: list[Row]) -> bool:
+    """Whether no other run is at least as accurate and as fast, and better in one of the two."""
     if row["max_error_mm"] == "":
         return False
-    others = (other for other in rows if other is not row and other["max_error_mm"] != "")
-    return not any(
-        other["max_error_mm"] <= row["max_error_mm"]
-        and other["loop_s"] <= row["loop_s"]
-        and (other["max_error_mm"], other["loop_s"]) != (row["max_error_mm"], row["loop_s"])
-        for other in others
-    )
+    error, seconds = row["max_error_mm"], row["loop_s"]
+    points = [(other["max_error_mm"], other["loop_s"]) for other in rows if other["max_error_mm"] != ""]
+    return not any(e <= error and s <= seconds and (e, s) != (error, seconds) for e, s in points)
 
 
-def records(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows for JSON: nothing where there is no number."""
+def records(rows: list[Row]) -> list[Row]:
+    """The rows for JSON: None where there is no number."""
     texts = ("value", "warnings", "failure")
     return [{name: None if v == "" and name not in texts else v for name, v in row.items()} for row in rows]
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """The runs as lines for the terminal: * none beats it in both error and time; ! it was warned of."""
-    error = f"{_named(rows)}, mm"
-    heading = f"{'':3}{'family':34}{'value':24}{error:>15}{'rms, mm':>10}{'misfit, mm':>12}"
-    lines = [heading + f"{'loop, s':>9}{'steps':>8}{'cells':>9}"]
+def show(rows: list[Row]) -> None:
+    """Print the rows: * marks a run that no other beats in both error and time, ! a run with warnings."""
+    numbers = {"max_error_mm": f"{_quantity(rows)}, mm", "rms_error_mm": "rms, mm", "cloud_misfit_mm": "misfit, mm"}
+    numbers |= {"loop_s": "loop, s", "steps": "steps", "cells": "cells"}
+    lines = []
     for row in rows:
-        if row["failure"]:
-            lines.append(f"   {row['family']:34}{row['value']:24}  {row['failure'][:90]}")
-            continue
-        names = (("max_error_mm", 15), ("rms_error_mm", 10), ("cloud_misfit_mm", 12), ("loop_s", 9))
-        numbers = [f"{row[name]:{width}.3g}" if row[name] != "" else " " * width for name, width in names]
-        if row["is_reference"]:
-            numbers[0] = f"{'reference':>15}"
-        marks = ("*" if row["pareto"] else "") + ("!" if row["warnings"] else "")
-        lines.append(f"{marks:3}{row['family']:34}{row['value']:24}{''.join(numbers)}{row['steps']:8}{row['cells']:9}")
+        cells = ["*" * bool(row["pareto"]) + "!" * bool(row["warnings"]), row["family"], row["value"]]
+        if not row["failure"]:
+            figures = [f"{v:.3g}" if isinstance(v, float) else str(v) for v in map(row.get, numbers)]
+            cells += ["reference", *figures[1:]] if row["is_reference"] else figures
+        lines.append((cells, row["failure"]))
+    print_table(["", "family", "value", *numbers.values()], lines, n_texts=3)
     if any(row["warnings"] for row in rows):
-        lines.append("! warned of: its report.json says why, and the column warnings of study.csv")
-    return "\n".join(lines)
+        print("! has warnings, in its report.json and in the column warnings of study.csv")

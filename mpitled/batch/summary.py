@@ -1,22 +1,24 @@
-"""The table of a sweep: a row for each case, as CSV, HDF5, Markdown and HTML, with the charts of it."""
+"""The table of a sweep: a row for each case, as CSV, HDF5, Markdown and HTML, and charts of its figures."""
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from mpitled import atomic, store
 from mpitled.batch import launch
-from mpitled.batch.cases import Told
+from mpitled.batch.cases import SweepRecord
+from mpitled.batch.terminal import print_table
+from mpitled.batch.vary import read_csv
 from mpitled.deck import unit_of
 from mpitled.errors import InputError
 from mpitled.results import markup
 
+#: Case, varied keys, figures, warnings, failure and times of one case; "" where there is no value.
 Row = dict[str, float | str]
 
 
@@ -24,9 +26,9 @@ class _Column(NamedTuple):
     """A figure of report.json in the table."""
 
     name: str
-    key: str  # in the report, parts joined by "."
+    key: str  # in report.json; "." separates its levels
     heading: str  # with its unit
-    form: str  # in the rendered table
+    form: str  # of a value in the rendered table
 
 
 COLUMNS = (
@@ -45,70 +47,76 @@ COLUMNS = (
     _Column("hexahedra", "cells.hexahedra", "hexahedra", "{:.0f}"),
     _Column("support_domains", "cells.support_domains", "support domains", "{:.0f}"),
 )
-#: In a file of their own, for they are never the same twice.
+#: In a file of their own, because times differ whenever a sweep is repeated.
 TIMES = (
     _Column("loop_s", "seconds.loop", "loop, s", "{:.1f}"),
     _Column("whole_s", "seconds", "run time, s", "{:.1f}"),
 )
-#: People see a mark, and the words below the table.
+#: The rendered table has a mark, and the words below the table.
 WARNINGS = _Column("warnings", "warnings", "warned", "{:.0}*")
-#: Numbers of the mesh are for the files, not for people, who see the mark first.
-_RENDERED = (WARNINGS, *COLUMNS[:-3], TIMES[-1])
-#: A name of a case in a chart is no longer.
-_LONGEST = 40
-#: Columns that are text, though it be empty.
+#: The figures with a chart and a rendered column: numbers of cells and steps are in the files only.
+_FIGURES = COLUMNS[:-3]
+_RENDERED = (WARNINGS, *_FIGURES, TIMES[-1])
+_LONGEST_NAME = 40  # of a case in a chart, characters
+#: Columns that are text even where all of their values are empty.
 _TEXTS = ("failure", WARNINGS.name)
-#: All columns of table.csv and times.csv but the case and its keys.
+#: All columns of table.csv and times.csv except the case and its keys.
 NAMES = (*(column.name for column in (*COLUMNS, *TIMES, WARNINGS)), "failure")
 
 
+class Table(NamedTuple):
+    """The rows of all cases, and the figures of others (`--beside`) for the same cases."""
+
+    keys: list[str]  # the varied keys
+    rows: list[Row]
+    others: dict[int, Row]  # by the number of the case
+    others_name: str
+
+
 class _Line(NamedTuple):
-    """A line of the table for people."""
+    """A line of the rendered table."""
 
     cells: list[str]
-    remark: str = ""  # instead of the other cells, why there are no figures
+    remark: str = ""  # in place of figures
+
+    @property
+    def all(self) -> list[str]:
+        return self.cells + [self.remark] * bool(self.remark)
 
 
-class Table(NamedTuple):
-    """The cases that ended, and those that others have of them; numbers, or text where there is none ("")."""
+def collect(sweep: SweepRecord, beside: Path | None = None) -> Table:
+    """The results of all cases: completed, broken or not computed.
 
-    keys: list[str]  # varied ones
-    rows: list[Row]  # case, keys, `COLUMNS`, warnings, failure, for each case of the sweep
-    times: list[Row]  # case, `TIMES`
-    beside: dict[int, Row]  # by case
-    beside_name: str
-
-
-def collect(sweep: Told, beside: Path | None = None) -> Table:
-    """What the cases gave, done, broken or not computed. `beside`: a CSV of the varied keys and columns of ours."""
-    rows, times = [], []
+    `beside` is a CSV file whose columns are the varied keys and columns of this table. InputError if it is not, or if
+    the report of a completed case cannot be read.
+    """
+    rows = []
     for case in sweep.cases:
-        failure = case.failure
-        found: dict[str, Any] = {}
+        failure, report = case.failure, {}
         if failure == "":
             try:
-                found = json.loads((case.folder / "report.json").read_text(encoding="utf-8"))
+                report = json.loads((case.folder / "report.json").read_text(encoding="utf-8"))
             except (OSError, ValueError) as error:
-                raise InputError(
-                    f"{case.folder}: has no report ({error}); remove the folder, and sweep again"
-                ) from None
-        given: Row = {"case": case.number} | {key: _number(case.values.get(key, "")) for key in sweep.keys}
-        figures: Row = {column.name: _figure(found, column.key) for column in COLUMNS}
-        warned: Row = {WARNINGS.name: "; ".join(found.get(WARNINGS.key, []))}
-        rows.append(given | figures | warned | {"failure": "not computed" if failure is None else failure})
-        times.append({"case": case.number} | {column.name: _figure(found, column.key) for column in TIMES})
-    theirs = _read_beside(beside, sweep.keys, rows) if beside else {}
-    return Table(sweep.keys, rows, times, theirs, beside.stem if beside else "")
+                message = f"{case.folder}: has no report ({error}); remove the folder, and sweep again"
+                raise InputError(message) from None
+        row: Row = {"case": case.number} | {key: _number(case.values.get(key, "")) for key in sweep.keys}
+        row |= {column.name: _figure(report, column.key) for column in COLUMNS}
+        row |= {WARNINGS.name: "; ".join(report.get(WARNINGS.key, []))}
+        row |= {"failure": "not computed" if failure is None else failure}
+        rows.append(row | {column.name: _figure(report, column.key) for column in TIMES})
+    others = _read_others(beside, sweep.keys, rows) if beside else {}
+    return Table(sweep.keys, rows, others, beside.stem if beside else "")
 
 
-def write(sweep: Told, table: Table) -> list[Path]:
+def write(sweep: SweepRecord, table: Table) -> list[Path]:
     """Write table.csv, times.csv, table.h5, table.md, table.html and the charts into the sweep's folder."""
-    folder = sweep.folder
+    folder, rows = sweep.folder, table.rows
     paths = [folder / name for name in ("table.csv", "times.csv", "table.h5", "table.md", "table.html")]
-    atomic.write_csv(paths[0], list(table.rows[0]), table.rows)
-    atomic.write_csv(paths[1], list(table.times[0]), table.times)
-    groups = {"table": table.rows, "times": table.times}
-    store.write_columns(paths[2], {name: _columns(rows) for name, rows in groups.items()})
+    times = ["case", *(column.name for column in TIMES)]
+    figures = [name for name in rows[0] if name not in times[1:]]
+    atomic.write_csv(paths[0], figures, rows)
+    atomic.write_csv(paths[1], times, rows)
+    store.write_columns(paths[2], {"table": _columns(rows, figures), "times": _columns(rows, times)})
     atomic.write_text(paths[3], markdown(table))
     with atomic.writing(folder):
         charts = _draw(table, folder)
@@ -124,38 +132,37 @@ def write(sweep: Told, table: Table) -> list[Path]:
 
 
 def markdown(table: Table) -> str:
-    """The table for people, in Markdown: under each case's row the one of others, if they have it."""
+    """The rendered table in Markdown, and the warnings below it."""
     headings, lines = _rendered(table)
-    text = [f"| {' | '.join(headings)} |", "|" + "---|" * len(headings)]
+    rows = [f"| {' | '.join(headings)} |", "|" + "---|" * len(headings)]
     for line in lines:
-        cells = line.cells + [line.remark] * bool(line.remark)
-        cells += [""] * (len(headings) - len(cells))
-        text.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
-    warned = [f"- {words}" for words in warnings(table)]
-    return "\n".join([*text, *([""] if warned else []), *warned]) + "\n"
+        cells = line.all + [""] * (len(headings) - len(line.all))
+        rows.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
+    warned = [f"- {text}" for text in warnings(table)]
+    return "\n".join([*rows, *([""] if warned else []), *warned]) + "\n"
 
 
-def text(table: Table) -> str:
-    """The table for a terminal."""
-    headings, lines = _rendered(table)
-    cells = [[*heading.split(", ")] for heading in headings]
-    depth = max(map(len, cells))
-    heads = [[(words + [""] * depth)[i] for words in cells] for i in range(depth)]
-    rows = [*(_Line(head) for head in heads), *lines]
-    widths = [max(len(line.cells[i]) for line in rows if i < len(line.cells)) for i in range(len(headings))]
-    made = []
-    for line in rows:
-        shown = [f"{cell:>{width}}" for cell, width in zip(line.cells, widths, strict=False)]
-        made.append("  ".join([*shown, line.remark] if line.remark else shown))
-    return "\n".join([*made, *warnings(table)])
+def show(table: Table) -> None:
+    """Print the rendered table, and the warnings below it."""
+    print_table(*_rendered(table))
+    print(*(f"{text}\n" for text in warnings(table)), sep="", end="")
 
 
 def records(table: Table) -> list[dict[str, Any]]:
-    """The rows with their times, for JSON."""
+    """The rows for JSON: None where there is no number."""
     return [
-        {name: None if value == "" and name not in _TEXTS else value for name, value in (row | time).items()}
-        for row, time in zip(table.rows, table.times, strict=True)
+        {name: None if value == "" and name not in _TEXTS else value for name, value in row.items()}
+        for row in table.rows
     ]
+
+
+def warnings(table: Table) -> list[str]:
+    """The warnings of the cases; cases with the same warnings share a line."""
+    warned: dict[str, list[str]] = {}
+    for row in table.rows:
+        if text := str(row[WARNINGS.name]):
+            warned.setdefault(text, []).append(" ".join(f"{key}={_value(row[key])}" for key in table.keys))
+    return [f"warning for {', '.join(cases)}: {text}" for text, cases in warned.items()]
 
 
 # --- the numbers ---------------------------------------------------------------------------------------------------
@@ -169,153 +176,135 @@ def _number(text: str) -> float | str:
 
 
 def _figure(report: Any, key: str) -> float | str:
-    for part in key.split("."):
-        report = report.get(part) if isinstance(report, dict) else None
-    if isinstance(report, dict):  # phases, of which the whole is asked for
+    for level in key.split("."):
+        report = report.get(level) if isinstance(report, dict) else None
+    if isinstance(report, dict):  # the seconds of all phases
         return float(sum(report.values()))
     return "" if report is None else report
 
 
-def _read_beside(path: Path, keys: Sequence[str], rows: Sequence[Row]) -> dict[int, Row]:
-    """By case, the row with the same values of the varied keys."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            names, theirs = reader.fieldnames or [], list(reader)
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); give a CSV of {', '.join(keys)} and figures") from None
+def _read_others(path: Path, keys: Sequence[str], rows: Sequence[Row]) -> dict[int, Row]:
+    """By case, the row of a CSV file with the same values of the varied keys."""
+    lines = read_csv(path, f"give a CSV of {', '.join(keys)} and figures")
+    names = lines[0][1] if lines else []
     known = {column.name for column in COLUMNS}
     if missing := [key for key in keys if key not in names]:
         raise InputError(f"{path}: has no column {missing[0]}, by which its rows belong to cases")
     if strange := [name for name in names if name not in (*keys, *known)]:
         raise InputError(f"{path}: {strange[0]} is no column of the table; there are {', '.join(sorted(known))}")
     found: dict[int, Row] = {}
-    for line, given in enumerate(theirs, 2):
-        their = {name: _number(given[name] or "") for name in names}
-        if wrong := [name for name in names if name in known and their[name] != "" and isinstance(their[name], str)]:
-            raise InputError(f"{path}: line {line}: {wrong[0]} = {their[wrong[0]]}: is not a number")
-        for row in rows:
-            if all(row[key] == their[key] for key in keys):
-                found[int(row["case"])] = their
+    for number, cells in lines[1:]:
+        other: Row = {name: _number(cell) for name, cell in zip(names, [*cells, *[""] * len(names)], strict=False)}
+        if wrong := [name for name in names if name in known and other[name] != "" and isinstance(other[name], str)]:
+            raise InputError(f"{path}: line {number}: {wrong[0]} = {other[wrong[0]]}: is not a number")
+        found |= {int(row["case"]): other for row in rows if all(row[key] == other[key] for key in keys)}
     return found
 
 
-def _columns(rows: Sequence[Row]) -> dict[str, list[float | str]]:
-    """Columns of numbers with nan where there is none; of text if there is a word in it, or for `_TEXTS`."""
-    columns: dict[str, list[float | str]] = {name: [row[name] for row in rows] for name in rows[0]}
+def _columns(rows: Sequence[Row], names: Sequence[str]) -> dict[str, list[float | str]]:
+    """Columns for HDF5: numbers, with nan where there is none, or text if any value is a word."""
+    columns: dict[str, list[float | str]] = {name: [row[name] for row in rows] for name in names}
     for name, values in columns.items():
         if name not in _TEXTS and all(value == "" or not isinstance(value, str) for value in values):
             columns[name] = [math.nan if value == "" else value for value in values]
     return columns
 
 
-# --- what people see -----------------------------------------------------------------------------------------------
+# --- the rendered table --------------------------------------------------------------------------------------------
 
 
 def _rendered(table: Table) -> tuple[list[str], list[_Line]]:
-    """Headings and lines of cells; of columns that no case has, none."""
-    columns = [c for c in _RENDERED if any((row | time)[c.name] != "" for row, time in _pairs(table))]
-    headings = [f"{key}, {unit}" if (unit := unit_of(key)) else key for key in table.keys]
-    headings += [*([""] if table.beside else []), *(column.heading for column in columns)]
-    headings += [] if columns else ["figures"]  # none: there is room for why
+    """Headings and lines, without the columns that are empty in all cases; the figures of others follow their case."""
+    columns = [column for column in _RENDERED if any(row[column.name] != "" for row in table.rows)]
+    headings = [*map(_with_unit, table.keys), *[""] * bool(table.others_name)]
+    headings += [column.heading for column in columns] or ["figures"]  # which a remark takes the place of
+
+    def cells(row: Row) -> list[str]:
+        return [c.form.format(row[c.name]) if row.get(c.name, "") != "" else "" for c in columns]
+
     lines = []
-    for row, time in _pairs(table):
-        values = [_value(row[key]) for key in table.keys]
-        who = ["here"] if table.beside else []
-        if row["failure"]:
-            lines.append(_Line([*values, *who], str(row["failure"])))
-        else:
-            lines.append(_Line([*values, *who, *_cells(row | time, columns)]))
-        if any(theirs := _cells(table.beside.get(int(row["case"]), {}), columns)):
-            lines.append(_Line([*[""] * len(values), table.beside_name, *theirs]))
+    for row in table.rows:
+        case = [*(_value(row[key]) for key in table.keys), *["here"] * bool(table.others_name)]
+        failure = str(row["failure"])
+        lines.append(_Line(case, failure) if failure else _Line([*case, *cells(row)]))
+        if any(theirs := cells(table.others.get(int(row["case"]), {}))):
+            lines.append(_Line([*[""] * len(table.keys), table.others_name, *theirs]))
     return headings, lines
 
 
-def warnings(table: Table) -> list[str]:
-    """What the marked cases were warned of, a line for all that were warned of the same."""
-    warned: dict[str, list[str]] = {}
-    for row in table.rows:
-        if words := str(row[WARNINGS.name]):
-            warned.setdefault(words, []).append(" ".join(f"{key}={_value(row[key])}" for key in table.keys))
-    return [f"warning for {', '.join(marked)}: {words}" for words, marked in warned.items()]
-
-
-def _pairs(table: Table) -> Iterator[tuple[Row, Row]]:
-    return zip(table.rows, table.times, strict=True)
-
-
-def _cells(row: Row, columns: Sequence[_Column]) -> list[str]:
-    return [c.form.format(row[c.name]) if row.get(c.name, "") != "" else "" for c in columns]
-
-
-def _draw(table: Table, folder: Path) -> list[Path]:
-    """The charts: each quantity against the first varied key that is a number; distance from rest against run time."""
-    try:
-        from mpitled.results import charts
-    except ImportError:
-        print(f"{folder}: no charts, for matplotlib is missing: pip install 'mpitled[pictures]'", file=sys.stderr)
-        return []
-    rows = [row | time for row, time in _pairs(table) if not row["failure"]]
-    made = []
-    numeric = [key for key in table.keys if len({row[key] for row in rows if not isinstance(row[key], str)}) > 1]
-    drawn = [column for column in COLUMNS[:-3] if any(row[column.name] not in ("", 0) for row in rows)]
-    if numeric and drawn:
-        key = numeric[0]
-        others = [other for other in table.keys if other != key]
-        families: dict[str, list[Row]] = {}
-        for row in rows:
-            if not isinstance(row[key], str):
-                families.setdefault(" ".join(f"{other}={row[other]}" for other in others), []).append(row)
-        if table.beside:
-            families[table.beside_name] = list(table.beside.values())
-        quantities, shares = {c.name: c.heading for c in drawn}, {c.name for c in drawn if "%" in c.form}
-        label = f"{key}, {unit}" if (unit := unit_of(key)) else key
-        charts.draw_quantities(families, key, label, quantities, shares, folder / "quantities.png")
-        made.append(folder / "quantities.png")
-    if timed := [row for row in rows if row["static_distance_mm"] != "" and row["loop_s"] != ""]:
-        points = [
-            (float(row["loop_s"]), float(row["static_distance_mm"]), name + (" (warned)" if row[WARNINGS.name] else ""))
-            for row, name in zip(timed, _names(timed, table.keys), strict=True)
-        ]
-        charts.draw_cost(points, folder / "cost.png")
-        made.append(folder / "cost.png")
-    return made
+def _with_unit(key: str) -> str:
+    return f"{key}, {unit}" if (unit := unit_of(key)) else key
 
 
 def _value(value: float | str) -> str:
     return f"{value:.10g}" if isinstance(value, float) else value
 
 
+def _draw(table: Table, folder: Path) -> list[Path]:
+    """Draw each figure against the first varied number, and the distance from the static solution against run time."""
+    try:
+        from mpitled.results import charts
+    except ImportError:
+        message = "no charts, because matplotlib is missing: pip install 'mpitled[pictures]'"
+        print(f"{folder}: {message}", file=sys.stderr)
+        return []
+    rows = [row for row in table.rows if not row["failure"]]
+    made = []
+    numeric = [key for key in table.keys if len({row[key] for row in rows if not isinstance(row[key], str)}) > 1]
+    drawn = [column for column in _FIGURES if any(row[column.name] not in ("", 0) for row in rows)]
+    if numeric and drawn:
+        key = numeric[0]
+        families: dict[str, list[Row]] = {}
+        for row in rows:
+            if not isinstance(row[key], str):
+                name = " ".join(f"{other}={row[other]}" for other in table.keys if other != key)
+                families.setdefault(name, []).append(row)
+        if table.others_name:
+            families[table.others_name] = list(table.others.values())
+        made.append(folder / "quantities.png")
+        shares = {column.name for column in drawn if "%" in column.form}
+        charts.draw_quantities(families, key, _with_unit(key), {c.name: c.heading for c in drawn}, shares, made[-1])
+    if timed := [row for row in rows if row["static_distance_mm"] != "" and row["loop_s"] != ""]:
+        points = [
+            (float(row["loop_s"]), float(row["static_distance_mm"]), name + (" (warned)" if row[WARNINGS.name] else ""))
+            for row, name in zip(timed, _names(timed, table.keys), strict=True)
+        ]
+        made.append(folder / "cost.png")
+        charts.draw_cost(points, made[-1])
+    return made
+
+
 def _names(rows: Sequence[Row], keys: Sequence[str]) -> list[str]:
-    """Cases in a chart: the value of a key; of several keys with the last parts of their names, if there is room."""
+    """Names of cases in a chart: values of several keys with the last parts of the keys, if the names stay short."""
     named = [" ".join(f"{key.rpartition('.')[2]}={_value(row[key])}" for key in keys) for row in rows]
-    if len(keys) > 1 and max(map(len, named)) <= _LONGEST:
+    if len(keys) > 1 and max(map(len, named)) <= _LONGEST_NAME:
         return named
     return [" ".join(_value(row[key]) for key in keys) for row in rows]
 
 
-def _html(sweep: Told, table: Table, charts: Sequence[Path]) -> str:
-    """A page that is one file: the table, and the charts."""
+def _html(sweep: SweepRecord, table: Table, charts: Sequence[Path]) -> str:
+    """A page with the table and the charts, in one file."""
     headings, lines = _rendered(table)
-    title, n = sweep.title or sweep.deck.stem, len(sweep.cases)
-    alt = {
-        "quantities": f"Charts of the results against {table.keys[0]}",
-        "cost": "Chart of the distance from the static solution in mm against the time of the loop in s",
-    }
     captions = {
-        "quantities": "Lines join the cases in their order, between which nothing was computed. The misfit is what the "
-        "cloud is uncertain by at its worst node; the volume balance, what of the grown volume was not found again.",
-        "cost": "How far each case ended from rest, by its own estimate, against the time that its steps took.",
+        "quantities": (
+            f"Charts of the results against {table.keys[0]}",
+            "Lines join the cases in their order; nothing was computed between the cases. The misfit is the largest "
+            "residual of the cloud's fit; the volume balance is the share of the grown volume that is unaccounted for.",
+        ),
+        "cost": (
+            "Chart of the distance from the static solution in mm against the time of the loop in s",
+            "The distance of each case from rest, as the case estimates it, against the time of its steps.",
+        ),
     }
-    head = [f"{n} cases of {sweep.deck.name}, varied: {', '.join(table.keys)}"]
-    head += [f"All of them with {', '.join(sweep.base)}"] if sweep.base else []
+    head = [f"{len(sweep.cases)} cases of {sweep.deck.name}, varied: {', '.join(table.keys)}"]
+    head += [f"All cases with {', '.join(sweep.overrides)}"] if sweep.overrides else []
     head.append(f"Pages of single cases: mpitled report {sweep.cases[0].folder} --html, and so on")
     return markup.render(
         "sweep.html",
-        title=title,
+        title=sweep.title or sweep.deck.stem,
         head=head,
         headings=headings,
-        rows=[line.cells + [line.remark] * bool(line.remark) for line in lines],
+        rows=[line.all for line in lines],
         warnings=warnings(table),
-        pictures=[markup.Picture(path.read_bytes(), alt[path.stem], captions[path.stem]) for path in charts],
+        pictures=[markup.Picture(path.read_bytes(), *reversed(captions[path.stem])) for path in charts],
     )

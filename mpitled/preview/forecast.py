@@ -1,4 +1,4 @@
-"""What a run will take: steps and surveys, the time of each, measured on the model itself, and room on the disc."""
+"""What a run will take: its steps and stability checks, their times as measured on the model, and space on the disc."""
 
 from __future__ import annotations
 
@@ -21,68 +21,63 @@ from mpitled.solver.output import cell_data
 from mpitled.terms import Scene
 from mpitled.terms.term import Method
 
-#: Times that each term is called to tell how long it takes; the fastest counts, for others may use the machine too.
+#: Calls of each term; the fastest counts, because other processes may use the machine as well.
 CALLS = 9
 
 
 class Forecast(NamedTuple):
-    """Steps and times of the loop, and the result's size; building, pictures and a ramp's way to rest come on top."""
+    """Steps and times of the loop, and the size of the result; without building, pictures and a ramp's relaxation."""
 
     steps: int
-    surveys: int
-    at_least: bool  # whether the method goes on until it is at rest, which nobody knows beforehand
+    checks: int
+    at_least: bool  # whether the method goes on until it is at rest
     step_s: float
-    survey_s: float
+    check_s: float
     output_bytes: int
 
     @property
     def loop_s(self) -> float:
-        return self.steps * self.step_s + self.surveys * self.survey_s
+        """Time of the loop, s."""
+        return self.steps * self.step_s + self.checks * self.check_s
 
     def describe(self) -> str:
-        """In a line."""
+        """One line."""
         least = "at least " if self.at_least else ""
         steps = f"{least}{self.steps} steps of {1e3 * self.step_s:.2g} ms, so {least}{self.loop_s:.2g} s of stepping"
         return f"{steps}, on one rank here; {resources.format_bytes(self.output_bytes)} of results"
 
 
-def measure(method: Integrator) -> tuple[dict[str, float], float]:
-    """Seconds that each term of a step takes on the state that the method has, and those of a survey."""
-    seconds: dict[str, float] = dict.fromkeys((term.name for term in method.step.terms), math.inf)
+def measure(integrator: Integrator) -> tuple[dict[str, float], float]:
+    """Seconds of each term of a step at the current state, and of a stability check."""
+    seconds: dict[str, float] = dict.fromkeys((term.name for term in integrator.step.terms), math.inf)
     for _ in range(CALLS):
         step = dict.fromkeys(seconds, 0.0)
-        for term in method.step.terms:  # in their order: the halo's end needs its beginning
-            step[term.name] += _seconds(partial(term.apply, method.state))
+        for term in integrator.step.terms:  # in their order: the exchange ends after it begins
+            step[term.name] += _seconds(partial(term.apply, integrator.state))
         seconds = {name: min(least, step[name]) for name, least in seconds.items()}
-    return seconds, min(_seconds(method.check) for _ in range(CALLS))
+    return seconds, min(_seconds(integrator.check) for _ in range(CALLS))
 
 
-def expect(method: Integrator, step: float, survey: float, output_bytes: int) -> Forecast:
-    """What a method that is ready to begin will take, at so many seconds a step and a survey."""
-    at_least = method.scene.method is Method.RELAXATION
-    return Forecast(method.expected_steps, method.expected_checks, at_least, step, survey, output_bytes)
+def expect(integrator: Integrator, step: float, check: float, output_bytes: int) -> Forecast:
+    """The forecast for an integrator before its first step; step and check in s."""
+    at_least = integrator.scene.method is Method.RELAXATION
+    return Forecast(integrator.expected_steps, integrator.expected_checks, at_least, step, check, output_bytes)
 
 
 def forecast(deck: Deck, model: Model) -> Forecast:
-    """What a run takes on one rank of this machine. InputError if the deck's step is too long for the model."""
-    with tempfile.TemporaryDirectory() as folder:  # ranks read their part from a file, and so does this one
+    """The forecast for a run on one rank of this machine. InputError if the deck's step is too long for the model."""
+    with tempfile.TemporaryDirectory() as folder:  # a rank reads its part of a model from a file
         path = Path(folder) / "model.h5"
         store.write_model(path, model, "")
-        method = first_rank(deck, path)
-    method.warm_up()
-    method.begin()
-    seconds, survey = measure(method)
-    size = store.result_bytes(method.sub.rows, deck.output.frames + 1, cell_data(deck))
-    return expect(method, sum(seconds.values()), survey, size)
-
-
-def first_rank(deck: Deck, path: Path, ranks: int = 1) -> Integrator:
-    """The integrator of rank 0 at rest, of a model that is cut for so many ranks; it does without the others."""
-    rows, figures = store.read_part(path, ranks, 0), store.read_figures(path)
-    solver, frames, world = deck.solver, deck.output.frames, World()
-    hourglass, rule, precision = deck.hexahedra.hourglass, deck.hexahedra.gradient, PRECISIONS[solver.precision]
+        rows, figures = store.read_part(path, 1, 0), store.read_figures(path)
+    hourglass, rule, precision = deck.hexahedra.hourglass, deck.hexahedra.gradient, PRECISIONS[deck.solver.precision]
     sub = localise(rows, hourglass, deck.support.stabilisation, rule, precision)
-    return make_integrator(Scene(sub, solver, deck=deck), frames, world, figures)
+    integrator = make_integrator(Scene(sub, deck.solver, deck=deck), deck.output.frames, World(), figures)
+    integrator.warm_up()
+    integrator.begin()
+    seconds, check = measure(integrator)
+    size = store.result_bytes(rows, deck.output.frames + 1, cell_data(deck))
+    return expect(integrator, sum(seconds.values()), check, size)
 
 
 def _seconds(act: Callable[[], object]) -> float:

@@ -1,4 +1,4 @@
-"""What `mpitled check` prints: the contents of a mesh file or of a deck's mesh, after all checks of it."""
+"""`mpitled check`: the contents of a mesh file or of the mesh of a deck, after all checks; the forecast of a run."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from mpitled.preview import forecast
 from mpitled.readers import meshes, solids
 from mpitled.readers.meshfile import MeshFile
 
-#: A tumour this near to the plane between left and right is in the middle, m.
+#: A tumour closer than this to the plane between left and right is in the middle, m.
 _MIDDLE = 0.5e-3
 
 
 class Item(NamedTuple):
-    """One thing that is in a file."""
+    """One statement about the contents of a file."""
 
     name: str  # "" for a remark
     text: str
-    figures: Any  # the same for JSON; dictionaries of the same name are one
+    figures: Any  # for JSON; dictionaries of the same name are merged
 
 
 def check(path: Path, overrides: Sequence[str] = ()) -> str:
-    """Contents and remarks of a mesh file or of a deck (TOML), a line each; errors as `figures`."""
+    """Contents and remarks of a mesh file or a deck (TOML), a line each. InputError if it cannot be used."""
     return "\n".join(f"{item.name:16} {item.text}" if item.name else item.text for item in _items(path, overrides))
 
 
 def figures(path: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
-    """Contents and remarks of a mesh file or of a deck (TOML); InputError if it cannot be computed with."""
+    """Contents and remarks of a mesh file or a deck (TOML), for JSON. InputError if it cannot be used."""
     found: dict[str, Any] = {"remarks": []}
     for name, _, value in _items(path, overrides):
         key = name.replace(" ", "_") or "remarks"
@@ -55,8 +55,8 @@ def _items(path: Path, overrides: Sequence[str]) -> Iterator[Item]:
     if path.suffix.lower() == ".toml":
         return _deck(load_deck(path, overrides))
     if label_image.is_image(path):
-        what = f'mpitled info {path}; a deck computes it by: [labels] image = "{path.name}"'
-        raise InputError(f"{path}: is an image; list its labels by: {what}")
+        remedy = f'mpitled info {path}; a deck computes it by: [labels] image = "{path.name}"'
+        raise InputError(f"{path}: is an image; list its labels by: {remedy}")
     if overrides:
         raise InputError(f"{path}: is a mesh and has no keys to override; leave out --set")
     return _file(meshes.read_file(path))
@@ -66,11 +66,8 @@ def _deck(deck: Deck) -> Iterator[Item]:
     mesh = model_build.read_mesh(deck)
     model = model_build.discretise(deck, mesh)
     efg = mesh.n_nodes - mesh.n_fe_nodes
-    yield Item(
-        "nodes",
-        f"{mesh.n_nodes} ({mesh.n_fe_nodes} FE, {efg} EFG)",
-        {"all": mesh.n_nodes, "fe": mesh.n_fe_nodes, "efg": efg},
-    )
+    nodes = {"all": mesh.n_nodes, "fe": mesh.n_fe_nodes, "efg": efg}
+    yield Item("nodes", f"{mesh.n_nodes} ({mesh.n_fe_nodes} FE, {efg} EFG)", nodes)
     yield Item("hexahedra", f"{len(mesh.hexahedra)}", len(mesh.hexahedra))
     n_points, volume = len(mesh.integration_points), float(mesh.integration_volumes.sum() * 1e9)
     yield Item("integration", f"{n_points} points, {volume:.6g} mm3", {"points": n_points, "volume_mm3": volume})
@@ -94,46 +91,48 @@ def _deck(deck: Deck) -> Iterator[Item]:
 
 
 def _tumour(tumour: Tumour, mesh: Mesh, *, x_is_right: bool) -> Item:
-    """Where it lies, how large it grows, and how far its centre is from the nearest nodes of what is around it."""
+    """Place and growth of the tumour, and the distances of its centre from the nodes of nearby structures."""
     centre, radius = np.asarray(tumour.centre), sphere_radius(tumour.volume)
-    around = {}
+    n = len(mesh.hexahedra)
+    structures = {}
     for name in label_image.VENTRICLES:
         cells = mesh.cell_sets.get(name, np.empty(0, np.int64))
-        around[name] = mesh.points[np.unique(mesh.hexahedra[cells[cells < len(mesh.hexahedra)]])]
+        structures[name] = mesh.points[np.unique(mesh.hexahedra[cells[cells < n]])]
     for name in model_build.OUTER:
         outer = np.setdiff1d(mesh.node_sets.get(name, ()), mesh.node_sets[model_build.TUMOUR])
-        around[name] = mesh.points[outer.astype(np.int64)]
-    around = {name: points for name, points in around.items() if len(points)}
-    apart = {name: float(np.linalg.norm(points - centre, axis=1).min()) for name, points in around.items()}
-    ventricles = sorted((name for name in label_image.VENTRICLES if name in apart), key=apart.__getitem__)
+        structures[name] = mesh.points[outer.astype(np.int64)]
+    structures = {name: points for name, points in structures.items() if len(points)}
+    distances = {name: float(np.linalg.norm(points - centre, axis=1).min()) for name, points in structures.items()}
+    ventricles = sorted((name for name in label_image.VENTRICLES if name in distances), key=distances.__getitem__)
 
     across = float(centre[0] - (mesh.points[:, 0].min() + mesh.points[:, 0].max()) / 2)
     if len(ventricles) == 2:
-        left, right = (around[name][:, 0].mean() for name in label_image.VENTRICLES)
+        left, right = (structures[name][:, 0].mean() for name in label_image.VENTRICLES)
         across *= 1 if left < right else -1
-    elif not x_is_right:  # nobody knows
+    elif not x_is_right:  # the side is unknown
         across = 0.0
     side = "" if abs(across) < _MIDDLE else "right" if across > 0 else "left"
-    told = [*ventricles[:1], *(name for name in model_build.OUTER if name in apart)]
-    text = f"{format_position(centre)}{side and f', {side} of the middle'}"
     grown = tumour.volume - 4 / 3 * np.pi * tumour.seed_radius**3
-    text += f"; {1e9 * tumour.volume:.10g} mm3, {1e9 * grown:.5g} of it grown, radius {1e3 * tumour.seed_radius:g} -> "
-    text += format_length(radius)
-    if told:
-        text += "; " + ", ".join(f"{format_length(apart[name])} from the {name.replace('_', ' ')}" for name in told)
+    nearest = [*ventricles[:1], *(name for name in model_build.OUTER if name in distances)]
+    parts = [
+        f"{format_position(centre)}{side and f', {side} of the middle'}",
+        f"{1e9 * tumour.volume:.10g} mm3, {1e9 * grown:.5g} of it grown, radius {1e3 * tumour.seed_radius:g} -> "
+        f"{format_length(radius)}",
+        ", ".join(f"{format_length(distances[name])} from the {name.replace('_', ' ')}" for name in nearest),
+    ]
     figures = {
         "centre_mm": (1e3 * centre).tolist(),
         "side": side,
         "volume_mm3": 1e9 * tumour.volume,
         "seed_radius_mm": 1e3 * tumour.seed_radius,
         "radius_mm": 1e3 * radius,
-        "distance_mm": {name: 1e3 * distance for name, distance in apart.items()},
+        "distance_mm": {name: 1e3 * distance for name, distance in distances.items()},
     }
-    return Item("tumour", text, figures)
+    return Item("tumour", "; ".join(filter(None, parts)), figures)
 
 
 def _file(file: MeshFile) -> Iterator[Item]:
-    """A mesh file alone: as an FE mesh if it has hexahedra, else as what it can be, in its own units."""
+    """A mesh file by itself, in its own units."""
     remarks = list(_file_checks(file))
     yield Item("format", str(file.format), str(file.format))
     yield Item("nodes", f"{len(file.points)}", len(file.points))
@@ -148,10 +147,8 @@ def _file(file: MeshFile) -> Iterator[Item]:
     yield from _sets("cell set", file.cell_sets)
     for name, material in file.materials:
         density = "none" if material.density is None else f"{material.density:g}"
-        text = (
-            f"{material.name} in {name}: E {material.youngs_modulus:g}, nu {material.poissons_ratio:g}, "
-            f"density {density}"
-        )
+        elastic = f"E {material.youngs_modulus:g}, nu {material.poissons_ratio:g}"
+        text = f"{material.name} in {name}: {elastic}, density {density}"
         yield Item("material", text, {material.name: {"cells": name, "of_file": text}})
     yield from _constraints(file.constraints, file.node_sets, 1.0, "")
     yield from _remarks(dict.fromkeys(remarks))
@@ -162,6 +159,7 @@ def _remarks(texts: Iterable[str]) -> Iterator[Item]:
 
 
 def _file_checks(file: MeshFile) -> Iterator[str]:
+    """Remarks on a file as an FE mesh if all of its solids are hexahedra, else as a cloud."""
     kinds = {block.kind for block in file.cells if len(block.ids)}
     if "hexahedron" in kinds and not kinds & {"tetrahedron", "wedge", "pyramid"}:
         section = MeshFiles(fe=file.path)
@@ -170,18 +168,18 @@ def _file_checks(file: MeshFile) -> Iterator[str]:
         dofs = model_build.prescribe(deck, mesh)[0].dofs if mesh.constraints else np.empty(0, np.int64)
         yield from mesh.remarks
         none = np.empty((0, 8), np.int64)
-        said = checks.scene_remarks(mesh.points, mesh.hexahedra, none, mesh.n_fe_nodes, dofs)
-        yield from said if len(dofs) else [remark for remark in said if "rigid" not in remark]
+        remarks = checks.scene_remarks(mesh.points, mesh.hexahedra, none, mesh.n_fe_nodes, dofs)
+        yield from remarks if len(dofs) else [remark for remark in remarks if "rigid" not in remark]
     else:
         solids.check_solids(file)
         yield from file.remarks
         yield from solids.check_cloud(file)
-        yield (
-            f"warning: {file.path}: has {'no hexahedra' if 'hexahedron' not in kinds else 'more than hexahedra'}; it "
-            "may be mesh.efg" + (", and mesh.fe if mesh.dropped names the rest" if "hexahedron" in kinds else "")
-        )
+        has, more = "no hexahedra", ""
+        if "hexahedron" in kinds:
+            has, more = "more than hexahedra", ", and mesh.fe if mesh.dropped names the rest"
+        yield f"warning: {file.path}: has {has}; it may be mesh.efg{more}"
     if not file.constraints:
-        yield f"warning: {file.path}: fixes and displaces nothing; the deck has to"
+        yield f"warning: {file.path}: fixes and displaces nothing; the deck has to do so"
 
 
 def _extent(points: NDArray[np.float64], scale: float, unit: str) -> Item:
@@ -203,12 +201,7 @@ def _constraints(
         n = len(node_sets.get(constraint.node_set, ()))
         name, text = "fixed", f"{constraint.node_set} ({n} nodes) in {axes}"
         if any(isinstance(value, np.ndarray) or value for value in constraint.displacement):
-            moves = ", ".join(_moved(value, scale) for value in constraint.displacement)
-            name, text = "displaced", f"{text} by {moves}{unit}"
+            ends = [(np.min(value) * scale, np.max(value) * scale) for value in constraint.displacement]
+            moves = (f"{low:.6g} to {high:.6g}" if low < high else f"{low:.6g}" for low, high in ends)
+            name, text = "displaced", f"{text} by {', '.join(moves)}{unit}"
         yield Item(name, text, text)
-
-
-def _moved(value: float | NDArray[np.float64], scale: float) -> str:
-    if isinstance(value, np.ndarray):
-        return f"{value.min() * scale:.6g} to {value.max() * scale:.6g}"
-    return f"{value * scale:.6g}"
