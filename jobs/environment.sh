@@ -134,7 +134,7 @@ mpitled_set_up() { # in the top folder
     [ ! -x .venv/bin/python ] || mpitled_variables
     mpitled_has_h5py || mpitled_prepare
     # setuptools warns of folders that an editable install makes importable.
-    PYTHONWARNINGS=ignore .venv/bin/pip install -q --no-build-isolation -e '.[images,pictures,progress,tests]' ||
+    PYTHONWARNINGS=ignore .venv/bin/pip install -q --no-build-isolation -e '.[images,pictures,tests]' ||
         mpitled_fail "the packages that pyproject.toml names could not be installed (see above)"
     echo "$mpitled_stamp" >.venv/made-from
 }

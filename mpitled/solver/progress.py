@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from mpitled.errors import InterruptedRun
 from mpitled.parallel.halo import World
@@ -62,13 +63,16 @@ class Progress:
     def __init__(self, done: float, step: int) -> None:
         """done, step: share and step at which the run starts; not 0 if it is resumed."""
         self.begin, self.first_done, self.first_step = time.perf_counter(), done, step
-        self.tenth, self.bar = int(10 * done), None
+        self.tenth = int(10 * done)
+        self.bar: Any = None
         if sys.stderr.isatty():
-            try:
-                from tqdm import tqdm
-            except ImportError:
-                return
-            self.bar = tqdm(total=1.0, initial=done, bar_format="{percentage:3.0f}%|{bar}| {remaining} left{postfix}")
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+            columns = (TaskProgressColumn(), BarColumn(), TextColumn("{task.description}", markup=False))
+            self.bar = Progress(*columns, console=Console(stderr=True))
+            self.bar.add_task("", total=1.0, completed=done)
+            self.bar.start()
 
     def show(self, done: float, step: int, figures: dict[str, float]) -> None:
         seconds = max(time.perf_counter() - self.begin, 1e-9)
@@ -76,14 +80,13 @@ class Progress:
         state = (
             f"{rate:.0f} steps/s, kinetic/internal {figures['kinetic_ratio']:.1e}, min J {figures['min_jacobian']:.3f}"
         )
+        left = max(0.0, (1 - done) / max(done - self.first_done, 1e-9) * seconds)
         if self.bar is not None:
-            self.bar.set_postfix_str(state, refresh=False)
-            self.bar.update(max(0.0, done - self.bar.n))
+            self.bar.update(self.bar.task_ids[0], completed=done, description=f"{left:.0f} s left, {state}")
         elif (tenth := int(10 * done + 1e-6)) > self.tenth:  # the sum of all steps is short of 1 by round-off
             self.tenth = tenth
-            left = max(0.0, (1 - done) / (done - self.first_done) * seconds)
             print(f"{done:4.0%}  {left:5.0f} s left  {state}", file=sys.stderr, flush=True)
 
     def close(self) -> None:
         if self.bar is not None:
-            self.bar.close()
+            self.bar.stop()
