@@ -35,7 +35,6 @@ VOXEL_FORCES, HEXAHEDRON_FORCES, DOMAIN_FORCES = (
     f"{_PLAIN}[{scene}-0.1-mean]" for scene in ("voxels", "distorted", "domains")
 )
 GRADIENT = f"{KERNELS}::test_forces_are_the_gradient_of_the_energies[voxels]"
-ENERGY = f"{KERNELS}::test_energy_is_kept_by_the_central_difference"
 WAVE = f"{RUN}::test_a_wave_keeps_its_energy_while_the_step_shortens"
 STRETCHED = f"{RUN} -k homogeneous"
 RANKS = f"{RUN}::test_one_two_and_four_ranks_agree_and_repeat"

@@ -69,7 +69,8 @@ def check_growth(deck: Deck, mesh: Mesh, dofs: NDArray[np.int64], displacements:
     if radius > nearest:
         raise InputError(
             f"{deck.path}: tumour.volume = {1e9 * deck.tumour.volume:.10g}: its sphere of {format_length(radius)} "
-            f"radius reaches beyond the outer surface, which is fixed {format_length(nearest)} from tumour.centre; lower it"
+            f"radius reaches beyond the outer surface, which is fixed {format_length(nearest)} from tumour.centre; "
+            "lower it"
         )
 
 
