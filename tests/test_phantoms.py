@@ -8,7 +8,6 @@ from conftest import ROOT
 
 from mpitled import deck, kernels
 from mpitled.cells import hexahedra
-from mpitled.cells import support_domains as support
 from mpitled.errors import InputError
 from mpitled.mesh import Rotation
 from mpitled.meshing import o_grid
@@ -238,10 +237,10 @@ def test_constant_stress_is_in_balance_at_inner_nodes(tmp_path, shape, cloud):
         slopes = np.einsum("nai,naj->nij", model.points[cells], gradients)
         # Round-off, times the root of the worst condition of a moment matrix that is accepted.
         assert np.abs(slopes - np.eye(3)).max(initial=0) < 1e-12
-    forces = support.nodal_sum(model.hexahedra, V[:, None, None] * B, model.n_nodes)
+    forces = hexahedra.nodal_sum(model.hexahedra, V[:, None, None] * B, model.n_nodes)
     if cloud == "core":
         of_cloud = model.domain_volumes[:, None, None] * model.domain_gradients
-        forces += support.nodal_sum(model.domains, of_cloud, model.n_nodes)
+        forces += hexahedra.nodal_sum(model.domains, of_cloud, model.n_nodes)
     inner = np.setdiff1d(np.arange(model.n_nodes), model.node_sets["surface"])
     assert np.abs(forces[inner]).max() < 1e-11 * np.abs(forces).max()
 

@@ -8,21 +8,20 @@ from scipy.spatial import cKDTree
 from test_kernels import HOURGLASS, at, forces, part
 
 from mpitled.cells import hexahedra
+from mpitled.cells.hexahedra import nodal_sum
 from mpitled.cells.support_domains import (
     FLATTEST,
     POWERS,
     field_at_nodes,
-    find_domains,
     linear_projector,
     moving_least_squares,
-    nodal_sum,
-    repair,
     worst_condition,
 )
 from mpitled.deck import load_deck
 from mpitled.errors import InputError
 from mpitled.mesh import CORNERS
 from mpitled.model.build import build
+from mpitled.model.domain_nodes import find_domains, repair
 from mpitled.parallel.subdomain import localise
 
 EPS = np.finfo(float).eps

@@ -16,7 +16,8 @@ from mpitled.mesh import Mesh
 from mpitled.meshing import checks
 from mpitled.model import CellBlock, Model, ModelFigures
 from mpitled.model import remarks as warnings
-from mpitled.model.cloud_fit import consistent_gradients, find_domains, without_orphans
+from mpitled.model.consistency import consistent_gradients
+from mpitled.model.domain_nodes import domains_of_mesh, without_orphans
 from mpitled.model.materials import assign_materials
 from mpitled.model.prescribed import check_growth, prescribe
 from mpitled.model.scene import OUTER, TUMOUR, read_mesh
@@ -32,7 +33,7 @@ def build(deck: Deck) -> Model:
 def discretise(deck: Deck, mesh: Mesh) -> Model:
     """The model of a deck from its mesh; see `build`."""
     material, materials = assign_materials(deck, mesh)
-    domains, found = find_domains(deck, mesh, material)
+    domains, found = domains_of_mesh(deck, mesh, material)
     mesh, domains, n_orphans = without_orphans(deck, mesh, domains)
     points, at, options = mesh.points, mesh.integration_points, deck.support
     shapes, gradients, condition = support.moving_least_squares(points[domains], at, options.basis, options.weight)

@@ -113,9 +113,7 @@ class _Reader:
         elif name in _GENERATING:
             keyword.fail("generates nodes or elements from others; let the preprocessor write them out")
         elif name in _LOADS:
-            self.found.remarks.append(
-                f"warning: {keyword.origin}: {keyword.shown} is not applied: loads are not supported"
-            )
+            self.found.remarks.append(text.load_warning(keyword))
         elif name in _INELASTIC:
             if self.material:
                 self.material.unusable = self.material.unusable or f"has {keyword.shown} ({keyword.origin})"

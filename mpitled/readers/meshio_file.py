@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import store
 from mpitled.errors import InputError
+from mpitled.hdf5 import check_hdf5
 from mpitled.mesh import Ints
 from mpitled.readers import meshfile
 from mpitled.readers.meshfile import Cells, MeshFile
@@ -49,14 +49,14 @@ def _check_hdf5(path: Path) -> None:
     with path.open("rb") as file:
         head = file.read(8)
     if head == b"\x89HDF\r\n\x1a\n":
-        store.check_hdf5(path)
+        check_hdf5(path)
     elif path.suffix.lower() in (".xdmf", ".xmf"):
         text = decode(read_text(path, "a mesh (XDMF)"))
         for name in sorted(set(re.findall(r"([^<>\s]+):/", text))):
             beside = path.parent / name
             if Path(name).name != name or not beside.is_file():
                 raise InputError(f"{path}: its data are in {name}, which is not beside it; put it there")
-            store.check_hdf5(beside)
+            check_hdf5(beside)
 
 
 def _converted(mesh: Any, path: Path) -> MeshFile:

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mpitled import store
-from mpitled.errors import InputError
+from mpitled import hdf5_validation, resources
+from mpitled.errors import InputError, damaged
+from mpitled.hdf5 import open_file
 from mpitled.mesh import Floats, Ints
 from mpitled.readers import meshfile
 from mpitled.readers.text import Block, decode, read_text, separated, where
@@ -20,7 +21,7 @@ def read_grid(path: Path) -> tuple[Floats, Floats, dict[str, Ints]]:
     between them. The first line may give the names of the columns. InputError if a volume is not positive.
     """
     if path.suffix.lower() in (".h5", ".hdf5", ".hdf"):
-        points, volumes = store.read_grid(path)
+        points, volumes = _read_hdf5(path)
         sets: dict[str, Ints] = {}
         first = None
     else:
@@ -87,6 +88,25 @@ def _rows_of(block: Block, width: int, names: str) -> Floats:
             f"({np.count_nonzero(counts != width)} such)"
         )
     return values.reshape(-1, width)
+
+
+def _read_hdf5(path: Path) -> tuple[Floats, Floats]:
+    """Positions (n, 3) and volumes (n,) from the datasets x, y, z and volume of the root group."""
+    names = ("x", "y", "z", "volume")
+    with open_file(path) as file, damaged(path, "write it anew"):
+        if missing := [name for name in names if name not in file]:
+            raise InputError(f"{path}: has no dataset '{missing[0]}'; give x, y, z and volume")
+        datasets = [hdf5_validation.member(file, name, path) for name in names]
+        shapes = {getattr(item, "shape", None) for item in datasets}
+        kinds = {item.dtype.kind for item in datasets if hasattr(item, "dtype")}
+        if len(shapes) > 1 or len(shapes.pop() or ()) != 1 or not kinds <= set("fiu"):
+            raise InputError(f"{path}: x, y, z and volume are not four lists of as many numbers; correct them")
+        for item in datasets:
+            hdf5_validation.check_dataset(item, path)
+        # Compressed data may be a thousand times as large as the file.
+        resources.check_memory(32 * len(datasets[0]), f"{path}: its {len(datasets[0])} points", "give fewer")
+        columns = [item[...].astype(np.float64) for item in datasets]
+    return np.stack(columns[:3], axis=1), columns[3]
 
 
 def _read_csv(path: Path) -> tuple[Floats, Floats, dict[str, Ints], int]:

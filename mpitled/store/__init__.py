@@ -8,8 +8,8 @@ from mpitled.store.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from mpitled.store.columns import read_grid, table_contents, write_columns
-from mpitled.store.files import check_hdf5, has_mpi, hdf5_version, read_rows
+from mpitled.store.columns import table_contents, write_columns
+from mpitled.store.files import has_mpi, hdf5_version, read_rows
 from mpitled.store.models import (
     check_model,
     describe_model,
@@ -45,7 +45,6 @@ __all__ = [
     "PartRows",
     "Result",
     "ResultWriter",
-    "check_hdf5",
     "check_model",
     "checkpoint_contents",
     "describe_model",
@@ -65,7 +64,6 @@ __all__ = [
     "read_blocks",
     "read_checkpoint",
     "read_figures",
-    "read_grid",
     "read_model",
     "read_part",
     "read_points",
