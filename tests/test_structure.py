@@ -21,8 +21,8 @@ MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob
 #: The folders and top modules of `mpitled`. Each imports only those before it.
 ORDER = [
     "errors", "atomic", "lock", "checksum", "resources", "hdf5_validation", "hdf5", "toml",
-    "laws", "mesh", "kernels", "cells", "deck", "meshing", "readers", "model", "store", "parallel", "terms", "solver", "results",
-    "export", "info", "scaffold", "job", "preview", "batch", "interface", "commands", "cli", "__main__",
+    "laws", "mesh", "kernels", "cells", "deck", "meshing", "readers", "model", "store", "parallel", "terms", "solver",
+    "results", "export", "info", "scaffold", "job", "preview", "batch", "interface", "commands", "cli", "__main__",
 ]  # fmt: skip
 #: Imports against the order. readers -> store: a reader of a grid needs the low-level functions of HDF5 in `store`.
 EXCEPTIONS = {("readers", "store")}
