@@ -86,13 +86,13 @@ def test_field_in_the_deck(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda rows: rows[:19], r"field.csv: has 19 places; give at least 20"),
+        (lambda rows: rows[:19], r"field.csv: has 19 points; give at least 20"),
         (
             lambda rows: rows[rows[:, 0] < 0],
-            r"scene.toml: displaced.0.field: the node at \(50, .* from the nearest place",
+            r"scene.toml: displaced.0.field: the node at \(50, .* from the nearest point",
         ),
-        (lambda rows: 10 * rows, r"displaced.0.field: the node at .* or see to the unit"),
-        (lambda rows: np.concatenate([rows, rows[:1]]), r"line 2: the same place is there twice"),
+        (lambda rows: 10 * rows, r"displaced.0.field: the node at .* or check the unit"),
+        (lambda rows: np.concatenate([rows, rows[:1]]), r"line 2: the same point is given twice"),
         (lambda rows: rows[:, :5], r"line 1.*|line 2: has 5 numbers; give x, y, z, ux, uy, uz"),
         (lambda rows: np.where(rows == rows[3, 5], 1e99, rows), r"line 5: a number is beyond"),
     ],
