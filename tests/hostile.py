@@ -266,7 +266,7 @@ def readers(scratch: Path) -> dict[str, Reader]:
     run, model, result, kept = _run(scratch)
     unpack = {".gz": (gzip.decompress, gzip.compress), ".npz": _rezip(bytes)}
     planned = cases.plan(
-        scratch / "run.toml", [{"solver.load_time": "1.0"}], ["output.pictures=false"], 1, scratch / "sweep"
+        scratch / "run.toml", [vary.Values({"solver.load_time": "1.0"})], ["output.pictures=false"], 1, scratch / "sweep"
     )
     planned.write_manifest()
     sweep = (scratch / "sweep" / cases.MANIFEST).read_bytes()

@@ -277,4 +277,4 @@ def test_names_do_not_lead_out_of_the_folder(tmp_path):
     mpitled("check", out / "export" / "scene.toml")
     assert {path.name for path in tmp_path.iterdir()} == {"deck.toml", "out"}
     assert not [path for path in tmp_path.parent.iterdir() if path.name.startswith("x")]
-    assert Path(vary.folder(name, "content")).name == vary.folder(name, "content")
+    assert Path(vary.folder_name(name, "content")).name == vary.folder_name(name, "content")

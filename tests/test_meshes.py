@@ -411,7 +411,8 @@ def test_exported_materials_are_read_as_what_they_were(void):
         Material(f"m{i}", NeoHookean(youngs_modulus=float(E), poissons_ratio=float(nu)), 1000.0)
         for i, (E, nu) in enumerate(laws)
     ]
-    model = replace(model, materials=tuple(given), material=np.arange(n, dtype=np.int16))
+    blocks = [replace(block, material=np.arange(n, dtype=np.int16)[cells]) for cells, block in model.numbered()]
+    model = replace(model, materials=tuple(given), blocks=tuple(blocks))
     store.write_model(void / "model.h5", model, "key", {})
     export.write_abaqus(void / "model.h5", void / "decks")
     file = meshes.read_file(void / "decks" / "fe.inp")

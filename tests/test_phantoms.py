@@ -287,11 +287,11 @@ def test_turned_nodes_keep_to_their_arcs(degrees):
         rotation = Rotation(np.radians(degrees), axis, tuple(centre))
         full, turns = loading.rotation_path(points, rotation)
         path, share = np.empty(full.size), 0.37
-        kernels.follow(path, full.ravel(), turns.reshape(-1, 3), share)
+        kernels.rotate_prescribed(path, full.ravel(), turns.reshape(-1, 3), share)
         across = [(axis + 1) % 3, (axis + 2) % 3]
         before, after = ((p - centre)[:, across] @ [1, 1j] for p in (points, points + path.reshape(-1, 3)))
         np.testing.assert_allclose(after, before * np.exp(1j * share * rotation.angle), atol=1e-14)
-        kernels.follow(path, full.ravel(), turns.reshape(-1, 3), 1.0)
+        kernels.rotate_prescribed(path, full.ravel(), turns.reshape(-1, 3), 1.0)
         np.testing.assert_allclose(path, full.ravel(), rtol=0, atol=1e-15)
 
 
