@@ -37,9 +37,9 @@ def flux_volume(points, faces):
     p, total = points[faces], 0.0
     for s in (0.5 - 12**-0.5, 0.5 + 12**-0.5):
         for t in (0.5 - 12**-0.5, 0.5 + 12**-0.5):
-            place = np.array([(1 - s) * (1 - t), s * (1 - t), s * t, (1 - s) * t]) @ p
+            position = np.array([(1 - s) * (1 - t), s * (1 - t), s * t, (1 - s) * t]) @ p
             along_s, along_t = np.array([t - 1, 1 - t, t, -t]) @ p, np.array([s - 1, -s, s, 1 - s]) @ p
-            total += (place * np.cross(along_s, along_t)).sum() / 12
+            total += (position * np.cross(along_s, along_t)).sum() / 12
     return total
 
 
@@ -47,12 +47,12 @@ def test_parts_of_distorted_hexahedra_keep_volume_and_moments():
     points, hexahedra = distorted_block()
     whole, centroids = volumes_and_centroids(points[hexahedra])
     cuts = np.random.default_rng(1).integers(1, 4, (len(hexahedra), 3))
-    parts, places = volumes_and_centroids(subdivide(points[hexahedra], cuts))
+    parts, positions = volumes_and_centroids(subdivide(points[hexahedra], cuts))
     owner = np.repeat(np.arange(len(hexahedra)), cuts.prod(axis=1))
     # Round-off: sums of up to 27 parts.
     np.testing.assert_allclose(np.bincount(owner, parts), whole, rtol=1e-13)
     for i in range(3):
-        np.testing.assert_allclose(np.bincount(owner, parts * places[:, i]), whole * centroids[:, i], rtol=1e-12)
+        np.testing.assert_allclose(np.bincount(owner, parts * positions[:, i]), whole * centroids[:, i], rtol=1e-12)
     assert whole.sum() == pytest.approx(flux_volume(points, boundary_faces(hexahedra)), rel=1e-12)
 
 
@@ -101,9 +101,9 @@ def test_cloud_around_a_seed(shape):
     # No holes: each point outside the seed has a node within 1.25 spacings (0.87 on a cubic grid, 1.1 measured).
     rng = np.random.default_rng(3)
     corners = points[hexahedra[dropped]]
-    places = (rng.dirichlet(np.ones(8), (40, len(corners)))[..., None] * corners).sum(axis=2).reshape(-1, 3)
-    places = places[np.linalg.norm(places - centre, axis=1) > 0.002]
-    assert (tree.query(places)[0] / spacing(places)).max() < 1.25
+    positions = (rng.dirichlet(np.ones(8), (40, len(corners)))[..., None] * corners).sum(axis=2).reshape(-1, 3)
+    positions = positions[np.linalg.norm(positions - centre, axis=1) > 0.002]
+    assert (tree.query(positions)[0] / spacing(positions)).max() < 1.25
     # The spacing at the seed is that of the surface nodes, and it grows by `growth`.
     at_surface = np.sqrt(4 * np.pi * 0.002**2 / 400)
     assert spacing(seed)[0] == pytest.approx(at_surface)
@@ -154,8 +154,8 @@ def test_block(kind, with_tumour):
     assert hexahedra + mesh.integration_volumes.sum() == pytest.approx(total, rel=1e-12)
     assert (mesh.n_fe_nodes == 0) == (kind == "all")
     for i, axis in enumerate("xyz"):
-        for end, place in ((0, 0.0), (1, size[i])):
-            on_face = np.flatnonzero(mesh.points[:, i] == place)
+        for end, position in ((0, 0.0), (1, size[i])):
+            on_face = np.flatnonzero(mesh.points[:, i] == position)
             np.testing.assert_array_equal(mesh.node_sets[f"{axis}{end}"], on_face)
             assert len(on_face) == {"x": 13 * 9, "y": 11 * 9, "z": 11 * 13}[axis]
     corners = np.array([[x, y, z] for x in (0, size[0]) for y in (0, size[1]) for z in (0, size[2])])
