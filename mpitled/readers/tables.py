@@ -17,8 +17,8 @@ from mpitled.readers.text import Block, decode, read_text, separated, where
 def read_grid(path: Path) -> tuple[Floats, Floats, dict[str, Ints]]:
     """Points (n, 3), volumes (n,) and sets of integration points, in the file's units, from CSV or HDF5.
 
-    CSV has a line for each point: x, y, z, volume and, optionally, the names of the point's sets with semicolons
-    between them. The first line may give the names of the columns. InputError if a volume is not positive.
+    CSV has a line for each point: x, y, z, volume and, optionally, the names of the point's sets, separated by
+    semicolons. The first line may be the names of the columns. InputError if a volume is not positive.
     """
     if path.suffix.lower() in (".h5", ".hdf5", ".hdf"):
         points, volumes = _read_hdf5(path)
@@ -44,7 +44,7 @@ def read_grid(path: Path) -> tuple[Floats, Floats, dict[str, Ints]]:
 
 
 def read_areas(path: Path, metre: float, ids: Ints) -> Floats:
-    """Areas (n_nodes, 3), m^2, of a table of node, x, y, z; 0 for nodes without a line."""
+    """Areas (n_nodes, 3), m^2, from a table of node, x, y, z; 0 for nodes without a line."""
     rows, first = _read_table(path, ("node", "x", "y", "z"))
     numbering = meshfile.Numbering(ids)
     if (np.diff(numbering.ids) == 0).any():
@@ -59,7 +59,7 @@ def read_areas(path: Path, metre: float, ids: Ints) -> Floats:
 
 
 def read_field(path: Path) -> tuple[Floats, int]:
-    """Points and displacements (n, 6), x, y, z, ux, uy, uz in the file's unit, and the line of the first row."""
+    """Rows (n, 6) of x, y, z, ux, uy, uz in the file's unit, and the line of the first row."""
     rows, first = _read_table(path, ("x", "y", "z", "ux", "uy", "uz"))
     bad = np.flatnonzero(~(np.abs(rows) < meshfile.MAX_COORDINATE).all(axis=1))
     if len(bad):
@@ -70,7 +70,7 @@ def read_field(path: Path) -> tuple[Floats, int]:
 
 
 def _read_table(path: Path, names: tuple[str, ...]) -> tuple[Floats, int]:
-    """Numbers (n, len(names)) of a CSV file, and the line of the first row; the first line may give the names."""
+    """Numbers (n, len(names)) of a CSV file, and the line of the first row; the first line may be the names."""
     text = read_text(path, f"a table of {', '.join(names)} (CSV)")
     end = text.find(b"\n") + 1 or len(text)
     header = [name.strip().casefold() for name in decode(text[:end]).split(",")]
@@ -124,9 +124,9 @@ def _read_csv(path: Path) -> tuple[Floats, Floats, dict[str, Ints], int]:
     sets: dict[str, Ints] = {}
     if names:
         groups, group = np.unique(np.array(names), return_inverse=True)
-        for i, several in enumerate(groups.tolist()):
+        for i, set_names in enumerate(groups.tolist()):
             members = np.flatnonzero(group == i)
-            for name in filter(None, (part.strip() for part in several.split(";"))):
+            for name in filter(None, (part.strip() for part in set_names.split(";"))):
                 meshfile.extend_set(sets, name, members)
     return rows[:, :3].copy(), rows[:, 3].copy(), sets, 1 + named
 
