@@ -102,7 +102,6 @@ def test_model_comes_back_as_it_was(tmp_path: Path) -> None:
             assert same(getattr(model, column.name), getattr(back, column.name)), column.name
     assert [(block.name, block.kind) for block in back.blocks] == [(block.name, block.kind) for block in model.blocks]
     assert same(store.model_arrays(back), store.model_arrays(model))
-    assert same(store.read_sets(path)[0], model.node_sets)
     store.write_model(path, replace(model, node_sets={}, figures=ModelFigures(cloud_parts=np.int64(3))), "k")
     assert store.read_model(path).node_sets == {}
     assert store.read_model(path).figures.cloud_parts == 3
@@ -387,6 +386,6 @@ def test_a_frame_holds_what_was_announced(model_path: Path, tmp_path: Path) -> N
     with pytest.raises(ValueError, match="values for 96 rows"):
         writer.write_frame(0.0, point_data, {"J": cell_data["J"][1:]})
     writer.write_frame(0.0, point_data, cell_data)
-    with pytest.raises(ValueError, match="one more is written"):
+    with pytest.raises(ValueError, match="space for 1 frames"):
         writer.write_frame(1.0, point_data, cell_data)
     writer.close()
