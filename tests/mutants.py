@@ -165,7 +165,7 @@ MUTANTS: dict[str, list[tuple[str, str, str, str]]] = {
         ("forces are left as they were tried", "apply(s, self._forces)\n        if not full", "if not full",
          f"{SPECTRAL} -k leaves_the_forces"),
         ("a stiffer mode is not looked for", "or self.skipped + 1 >= self.full_every", "",
-         f"{SPECTRAL} -k stiffer_mode"),
+         f"{SPECTRAL} -k in_full"),
     ],
     "mpitled/solver/dynamic_relaxation.py": [
         ("masses fall at once", "MAX_MASS_DROP = 0.9", "MAX_MASS_DROP = 0.0", RELAXATION),
@@ -213,7 +213,7 @@ MUTANTS: dict[str, list[tuple[str, str, str, str]]] = {
          LABELS),
     ],
     "mpitled/meshing/head.py": [
-        ("repairs with the emptiest cube", "-1.0, np.pad(share, 1)", "-1.0, 1 - np.pad(share, 1)", LABELS),
+        ("repairs with the emptiest cube", "-1.0, np.pad(share, 1)", "-1.0, 1 - np.pad(share, 1)", f"{LABELS} -k random"),
     ],
     "mpitled/store/partitions.py": [
         ("each rank owns all nodes", "(rows >= first_row) & (rows < end_row)", "rows >= 0", f"{STORE} -k parts_are"),
