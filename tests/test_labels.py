@@ -148,6 +148,7 @@ def test_random_solids_are_repaired(seed):
     share[2:-2, 2:-2, 2:-2] = np.random.default_rng(seed).random((12, 11, 10))
     solid, added = solid_cells(share)
     assert added > 0
+    assert share[solid & (share < 0.5)].mean() > 0.25  # the fullest cubes are added: a random choice has 0.25
     _, hexahedra = Grid(np.zeros(3), 1.0, (14, 15, 16)).hexahedra(solid)
     assert n_pieces(hexahedra) == 1
     surface = boundary_faces(hexahedra)

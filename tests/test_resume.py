@@ -23,6 +23,7 @@ from mpitled.errors import InputError, InterruptedRun
 from mpitled.parallel.halo import World
 from mpitled.solver.progress import Progress
 from mpitled.solver.run import Run
+from mpitled.store import checkpoints
 
 BLOCK = (
     MIXED
@@ -148,6 +149,15 @@ def test_a_run_that_could_go_on_is_not_written_over(stopped, monkeypatch, capsys
     assert run(deck, folder, monkeypatch)["resumed_at_step"] == 0
     job.run(load_deck(deck), folder, World())
     assert "note: the result of an earlier run is there" in capsys.readouterr().err
+
+
+def test_nodes_of_a_checkpoint_may_be_in_any_order(tmp_path):
+    """Each rank writes the nodes that it owns, one rank after the other."""
+    written = np.array([7, 2, 9, 4])
+    with h5py.File(tmp_path / "file.h5", "w") as file:
+        file["node"], file["nodal/now/u"], file["own"] = written, written[:, None] / 8, np.zeros((1, 1))
+    fields, _ = checkpoints.read_checkpoint(tmp_path / "file.h5", np.array([2, 4, 7]))
+    assert np.array_equal(fields["now/u"][:, 0], np.array([2, 4, 7]) / 8)
 
 
 def test_a_damaged_checkpoint_is_named_and_the_one_before_it_used(stopped, monkeypatch, capsys):

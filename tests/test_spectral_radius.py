@@ -232,3 +232,17 @@ def test_the_iteration_leaves_the_forces_of_the_displacements(tmp_path, kind):
     s.f[:] = 0
     method.step.apply_forces(s)
     assert np.array_equal(s.f, left)
+
+
+def test_every_third_estimate_is_made_in_full_although_nothing_changes(tmp_path):
+    text = BLOCK.format(size=[30.0] * 3, cloud="none") + TISSUE.format(nu=0.49, fixed="z0")
+    deck, sub, figures = subdomain(tmp_path, text, 0)
+    method = integrator_of(sub, deck.solver.model_copy(update={"method": "dynamic"}), figures)
+    method.begin()
+    s, radius, skipped = method.state, method.spectral_radius, []
+    radius.full_every, radius.reference = 3, []
+    for _ in range(6):
+        radius.next_step = -1
+        radius.update(s, s.dt2_over_m[None], 4.0)
+        skipped.append(radius.skipped)
+    assert skipped == [0, 1, 2, 0, 1, 2]
