@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled.errors import InputError
-from mpitled.mesh import Constraint, Ints
+from mpitled.mesh import Constraint, Floats, Ints
 from mpitled.readers import meshfile, text
 from mpitled.readers.meshfile import Cells, FileMaterial, MeshFile, NodeTable, Numbering
 from mpitled.readers.text import Block, KeywordLine, decode, where
@@ -240,7 +240,7 @@ class _Reader:
             fields.pop()
         return _Card(fields, origin, self.parameters)
 
-    def _rows(self, keyword: _Keyword, widths: list[list[int]], dtype: type[int] | type[float]) -> NDArray[np.float64]:
+    def _rows(self, keyword: _Keyword, widths: list[list[int]], dtype: type[int] | type[float]) -> Floats:
         """Numbers (n_rows, n_fields) of all lines; a row has a line for each list of widths, and blanks are 0."""
         parts = [np.empty((0, sum(map(len, widths))), dtype)]
         pending: list[_Card] = []
