@@ -118,5 +118,5 @@ def shell_cells(nodes: Ints, faces: Ints) -> Ints:
 
 
 def whole_number(wanted: float) -> int:
-    """The nearest whole number, but at least 1."""
+    """The nearest integer, but at least 1."""
     return max(1, int(np.floor(wanted + 0.5)))

@@ -118,7 +118,7 @@ def _critical_steps(
 
 
 def _typical(critical: Floats, prescribed: Ints, in_domains: Ints) -> float:
-    """Median, s, of the critical steps (n_nodes,) of free nodes, outside the cloud if there are free nodes outside.
+    """Median, s, of the critical steps (n_nodes,) of free nodes, outside the cloud if possible.
 
     The cloud is fine next to a seed: mass scaling of a few nodes costs less than a short step for the whole model.
     """

@@ -21,8 +21,8 @@ def sphere_radius(volume: float) -> float:
 def growth(points: Floats, centre: Floats, seed_radius: float, volume: float) -> Floats:
     """Radial displacement (n, 3), m at full load, of nodes (n, 3), m, on the seed's surface to a sphere of that volume.
 
-    In a mesh that does not follow the seed, nodes are beside its surface. They move as incompressible tissue does: the
-    cube of the distance from the centre grows by R^3 - r0^3.
+    If a mesh does not follow the seed's surface, the nodes move as incompressible tissue does: the cube of the distance
+    from the centre grows by R^3 - r0^3.
     """
     cubed = ((points - centre) ** 2).sum(axis=1) ** 1.5
     grown = np.cbrt(cubed + sphere_radius(volume) ** 3 - seed_radius**3)

@@ -64,7 +64,7 @@ class ModelFigures:
     consistency_before: float | None = None  # largest imbalance of a constant stress, relative; None without a cloud
     consistency_after: float | None = None
     consistency_change: float | None = None  # of the gradients, relative
-    of_mesh: dict[str, float] = field(default_factory=dict)  # the mesher's own numbers by name
+    of_mesh: dict[str, float] = field(default_factory=dict)  # numbers of the mesher by name
 
     def flat(self) -> dict[str, float]:
         """All numbers by name, first those of the mesher; None is left out."""
@@ -84,8 +84,8 @@ class Model:
     node_ids: Ints  # (n_nodes,), node numbers in the input file
     blocks: tuple[CellBlock, ...]
     field_block: str  # name of the block that interpolates the field at EFG nodes; "" without EFG nodes
-    field_domains: Ints  # (n_efg_nodes,), the cell of that block that gives the field at an EFG node
-    field_shapes: Floats  # (n_efg_nodes, k), its MLS shape functions there
+    field_domains: Ints  # (n_efg_nodes,), cell of this block that gives the field at the node
+    field_shapes: Floats  # (n_efg_nodes, k), MLS shape functions of the cell at the node
     materials: tuple[Material, ...]
     mass: Floats  # (n_nodes,), kg
     prescribed_dofs: Ints  # (n_prescribed,), 3 node + direction, ascending
