@@ -1,7 +1,8 @@
-"""A checksum of arrays that ranks can add up: whoever has a part of an array computes that part's share.
+"""A checksum of arrays that is a sum: each rank computes the share of its part of an array.
 
-The multilinear hash of Carter and Wegman over words of 32 bits, modulo 2^64: each word times a key of its place. One
-wrong word, or two that changed places, never pass; random damage passes once in 2^32 times or less.
+The checksum is the multilinear hash of Carter and Wegman over words of 32 bits, modulo 2^64: the sum of each word times
+the key of its position. The checksum detects every change of a single word and every swap of two words; the probability
+that random damage passes is at most 2^-32.
 """
 
 from __future__ import annotations
@@ -12,25 +13,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: The golden ratio of 2^64, whose multiples are keys far from each other; odd, so that every key can be odd.
+#: 2^64 divided by the golden ratio: its multiples are distributed evenly.
 _GOLDEN = 0x9E3779B97F4A7C15
-_BLOCK = 1 << 15  # words at a time, which stay in the cache
+_BLOCK = 1 << 15  # words, which fit into the cache
 
 
 def share(values: NDArray[Any], first: int) -> int:
-    """What the entries of an array (flattened) from number `first` on give to its checksum."""
+    """The share of `values` (flattened) in the checksum of an array; first: index of the first value in the array."""
     values = np.ascontiguousarray(values).ravel()
-    if values.itemsize % 4:  # small integers and text: a word each
+    if values.itemsize % 4:  # one word for each small integer or character
         words, first_word = values.view(np.uint8 if values.dtype.kind == "S" else values.dtype).astype(np.uint32), first
     else:
         words, first_word = values.view(np.uint32), first * (values.itemsize // 4)
     total = 0
     for start in range(0, len(words), _BLOCK):
-        some = words[start : start + _BLOCK]
+        block = words[start : start + _BLOCK]
         begin = (first_word + start + 1) * 2 * _GOLDEN % (1 << 64)
-        keys = _STEPS[: len(some)] + np.uint64(begin)
+        keys = _STEPS[: len(block)] + np.uint64(begin)
         keys |= np.uint64(1)
-        keys *= some
+        keys *= block
         total += int(keys.sum())
     return total % (1 << 64)
 
@@ -39,6 +40,6 @@ _STEPS = np.arange(_BLOCK, dtype=np.uint64) * np.uint64(2 * _GOLDEN % (1 << 64))
 
 
 def total(shares: Iterable[int]) -> int:
-    """The checksum of an array from all of its shares, as a signed number of 64 bits."""
-    whole = sum(shares) % (1 << 64)
-    return whole - (1 << 64) if whole >> 63 else whole
+    """The checksum of an array from all its shares, as a signed integer of 64 bits."""
+    unsigned = sum(shares) % (1 << 64)
+    return unsigned - (1 << 64) if unsigned >> 63 else unsigned

@@ -1,4 +1,4 @@
-"""Cuts a mesh of blocks of cells into parts of equal cost: cells -> weighted graph -> METIS -> tables."""
+"""Partition a mesh into parts of equal cost: blocks of cells -> weighted graph -> METIS -> tables of the parts."""
 
 from partition.graph import Block, CellGraph, cell_graph
 from partition.metis import cut

@@ -1,4 +1,4 @@
-"""The graph of cells that METIS cuts: which cells are neighbours, and how many nodes they share."""
+"""The graph of cells for METIS: edges join neighbouring cells, and weights measure their shared nodes."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-#: Nodes that a cell without faces shares with its neighbours: as many as a face of a hexahedron has. Two such cells
-#: share these, or half of their nodes if that is more: in a dense cloud hundreds of cells have some node in common.
+#: Fewest shared nodes that join a mesh-free cell and another cell: the nodes of a hexahedron's face. Two mesh-free
+#: cells need half of their nodes if that is more, because in a dense cloud hundreds of cells share some node.
 SHARED = 4
 
-#: Nearest cells to which a cell without faces is joined: as many as a hexahedron has faces.
+#: Number of nearest mesh-free cells that a mesh-free cell is joined to: the number of a hexahedron's faces.
 NEAREST = 6
 
-#: Weight of an edge across a face inside a block of hexahedra; the unit of the other weights.
+#: Weight of an edge across a face of two hexahedra. Other weights are relative to this weight.
 FACE_WEIGHT = 64
 
 
@@ -32,9 +32,9 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class CellGraph:
-    """Undirected graph of cells in compressed rows, as METIS takes it.
+    """Undirected graph of cells in compressed rows, the format of METIS.
 
-    Cell i has the neighbours adjncy[xadj[i]:xadj[i + 1]]; each edge is in both rows; no cell is its own neighbour.
+    Cell i has the neighbours adjncy[xadj[i]:xadj[i + 1]]. Each edge is in the rows of both cells. There are no loops.
     """
 
     xadj: NDArray[np.int64]  # (n_cells + 1,)
@@ -47,7 +47,7 @@ class CellGraph:
 
 
 def connectivity(blocks: Sequence[Block]) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
-    """Compressed rows of the cells' nodes (offsets (n_cells + 1,), nodes), and the number of nodes in the mesh."""
+    """Nodes of the cells in compressed rows, (offsets (n_cells + 1,), nodes), and the number of nodes of the mesh."""
     flat = [np.ascontiguousarray(block.nodes, dtype=np.int64).ravel() for block in blocks if block.nodes.size]
     nodes = flat[0] if len(flat) == 1 else np.concatenate([np.empty(0, np.int64), *flat])
     sizes = [np.full(len(block.nodes), block.nodes.shape[1]) for block in blocks]
@@ -58,37 +58,37 @@ def connectivity(blocks: Sequence[Block]) -> tuple[NDArray[np.int64], NDArray[np
 def cell_graph(blocks: Sequence[Block]) -> CellGraph:
     """The graph of the cells of all blocks.
 
-    Cells with faces are joined across these. A cell without faces is joined to the `NEAREST` such cells around it and
-    to all cells that share enough nodes with it (see `SHARED`). Where pieces of the graph still have nodes in common,
-    single edges join them: the graph is in one piece where the mesh is. Time and memory grow linearly with the cells.
+    Edges join cells with a common face. They join a mesh-free cell to the `NEAREST` mesh-free cells and to all cells
+    that share enough nodes with it (see `SHARED`). Single edges join components of the graph that have common nodes, so
+    that the graph is connected where the mesh is connected. Time and memory are linear in the number of cells.
 
-    An edge weighs the sum of 1 / (d - 1) over the shared nodes, where d is the number of cells at the node (the clique
-    model of a net in Lengauer, Combinatorial Algorithms for Integrated Circuit Layout, 1990): METIS, which sees edges,
-    then makes few halo nodes. A dense cloud has many more edges per node than hexahedra have. With equal weights, cuts
-    would avoid the cloud.
+    The weight of an edge is the sum of 1 / (d - 1) over the shared nodes, where d is the number of cells at the node
+    (clique model of a net: Lengauer, Combinatorial Algorithms for Integrated Circuit Layout, 1990). With these weights,
+    few cut edges mean few halo nodes. A dense cloud has many more edges per node than hexahedra have: with equal
+    weights, cuts would avoid the cloud.
     """
     offsets, nodes, n_nodes = connectivity(blocks)
     n_cells = len(offsets) - 1
-    mates = _face_mates(offsets, nodes, *_face_tables(blocks), n_nodes)
+    across = _face_neighbours(offsets, nodes, *_face_tables(blocks), n_nodes)
     pairs = np.empty((0, 2), dtype=np.int64)
     if any(block.faces is None and len(block.nodes) for block in blocks):
         pairs = _meshfree_pairs(blocks, offsets, nodes, n_nodes)
-    tree = _forest(mates, pairs, n_cells)
-    n_pieces = int(np.count_nonzero(tree == np.arange(n_cells)))
-    if n_pieces > 1:
+    tree = _forest(across, pairs, n_cells)
+    n_components = int(np.count_nonzero(tree == np.arange(n_cells)))
+    if n_components > 1:
         start, touching = _cells_of_nodes(offsets, nodes, n_nodes)
-        bridges = np.empty((n_pieces - 1, 2), dtype=np.int64)
+        bridges = np.empty((n_components - 1, 2), dtype=np.int64)
         n_bridges = _bridges(tree, start, touching, bridges)
         pairs = np.concatenate([pairs, bridges[:n_bridges]])
     if len(pairs):
         weights = _weights(offsets, nodes, pairs, np.bincount(nodes, minlength=n_nodes))
-        return CellGraph(*_compressed_rows(mates, pairs, weights, n_cells))
-    xadj = np.concatenate([[0], np.cumsum(np.count_nonzero(mates >= 0, axis=1))])
-    return CellGraph(xadj, mates[mates >= 0], None)
+        return CellGraph(*_compressed_rows(across, pairs, weights, n_cells))
+    xadj = np.concatenate([[0], np.cumsum(np.count_nonzero(across >= 0, axis=1))])
+    return CellGraph(xadj, across[across >= 0], None)
 
 
 def _face_tables(blocks: Sequence[Block]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Number of the first cell of each block (n_blocks + 1,), and faces (n_blocks, n_faces, nodes), padded with -1."""
+    """First cell of each block, (n_blocks + 1,); faces of the blocks, (n_blocks, n_faces, nodes), padded with -1."""
     shapes = [block.faces.shape for block in blocks if block.faces is not None]
     tables = np.full((len(blocks), *np.max([(0, 1), *shapes], axis=0)), -1, np.int64)
     for table, block in zip(tables, blocks, strict=True):
@@ -100,9 +100,9 @@ def _face_tables(blocks: Sequence[Block]) -> tuple[NDArray[np.int64], NDArray[np
 def _meshfree_pairs(
     blocks: Sequence[Block], offsets: NDArray[np.int64], nodes: NDArray[np.int64], n_nodes: int
 ) -> NDArray[np.int64]:
-    """The edges of mesh-free cells, (n, 2) cells, the lower first, in order, each once.
+    """The edges of mesh-free cells, (n, 2) cells, lower cell first, sorted, without repetition.
 
-    A pair is sorted as one number, its key: the lower cell times the number of cells, plus the higher.
+    The key of a pair is one number: the lower cell times the number of cells, plus the higher cell.
     """
     n_cells = len(offsets) - 1
     meshfree = np.concatenate([np.full(len(block.nodes), block.faces is None) for block in blocks])
@@ -113,8 +113,8 @@ def _meshfree_pairs(
     keys = np.empty(len(near) + n_sharing, dtype=np.int64)
     keys[: len(near)] = near
     _sharing_keys(meshfree, offsets, nodes, start, touching, keys[len(near) :])
-    del near, start, touching  # a third of the peak of memory
-    keys.sort()  # np.unique takes ten times as long, and four times the memory
+    del near, start, touching  # a third of the peak memory
+    keys.sort()  # np.unique needs ten times the time and four times the memory
     keys = keys[np.concatenate([[True], keys[1:] != keys[:-1]])[: len(keys)]]
     pairs = np.empty((len(keys), 2), dtype=np.int64)
     np.divmod(keys, n_cells, out=(pairs[:, 0], pairs[:, 1]))
@@ -122,17 +122,17 @@ def _meshfree_pairs(
 
 
 def _nearest_keys(points: NDArray[np.float64], cells: NDArray[np.int64], n_cells: int) -> NDArray[np.int64]:
-    """Keys of pairs of a mesh-free cell and each of the `NEAREST` around it; points (n, 3) of cells (n,), ascending."""
+    """Keys of pairs of a mesh-free cell and its `NEAREST` mesh-free cells; points (n, 3) of ascending cells (n,)."""
     k = min(NEAREST + 1, len(points))
     near = cKDTree(points, balanced_tree=False).query(points, k=np.arange(1, k + 1))[1]
-    # A point finds itself, but not always first where points coincide.
+    # The nearest point is the point itself, or a coincident point.
     own, near = cells[:, None], cells[near]
     return (np.minimum(own, near) * n_cells + np.maximum(own, near))[near != own]
 
 
 @njit(cache=True)
 def _sorted_face(nodes, first, corners, face):  # type: ignore[no-untyped-def]
-    """Fills `face` with the nodes of a face, ascending; -1 after the last of a smaller face."""
+    """Fills `face` with the nodes of a face, ascending, then with -1."""
     for i in range(len(corners)):
         face[i] = -1
         if corners[i] >= 0:
@@ -145,7 +145,7 @@ def _sorted_face(nodes, first, corners, face):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _equal(a, b):  # type: ignore[no-untyped-def]
-    """Whether two arrays have the same entries; np.all would allocate a third."""
+    """Whether two arrays have the same entries; np.all would allocate an array."""
     same = True
     for i in range(len(a)):
         same &= a[i] == b[i]
@@ -153,11 +153,11 @@ def _equal(a, b):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _face_mates(offsets, nodes, first_cells, tables, n_nodes):  # type: ignore[no-untyped-def]
-    """The cell behind each face, (n_cells, n_faces), or -1; each cell once in a row.
+def _face_neighbours(offsets, nodes, first_cells, tables, n_nodes):  # type: ignore[no-untyped-def]
+    """The neighbour across each face, (n_cells, n_faces), or -1; a row has no repetition.
 
-    Faces are put into buckets by their lowest node. Only faces of one bucket can be equal; a bucket holds a dozen or
-    so. Of three cells at one face (a faulty mesh) two are joined.
+    A hash table with the lowest node as key holds the faces; a bucket has about a dozen faces. If three cells have the
+    same face (a faulty mesh), two cells are joined.
     """
     n, n_faces = len(offsets) - 1, tables.shape[1]
     face, candidate = np.empty(tables.shape[2], np.int64), np.empty(tables.shape[2], np.int64)
@@ -173,7 +173,7 @@ def _face_mates(offsets, nodes, first_cells, tables, n_nodes):  # type: ignore[n
     start = np.cumsum(start)
     free = start[:-1].copy()
     bucket = np.empty(start[-1], np.int64)
-    mates = np.full((n, n_faces), -1)
+    across = np.full((n, n_faces), -1)
     for c in range(n):
         for f in range(n_faces):
             if tables[block_of[c], f, 0] < 0:
@@ -181,16 +181,16 @@ def _face_mates(offsets, nodes, first_cells, tables, n_nodes):  # type: ignore[n
             _sorted_face(nodes, offsets[c], tables[block_of[c], f], face)
             for i in range(start[face[0]], free[face[0]]):
                 other, g = divmod(bucket[i], n_faces)
-                if mates[other, g] < 0:
+                if across[other, g] < 0:
                     _sorted_face(nodes, offsets[other], tables[block_of[other], g], candidate)
                     if _equal(candidate, face):
-                        if other != c and not np.any(mates[c] == other):
-                            mates[c, f], mates[other, g] = other, c
+                        if other != c and not np.any(across[c] == other):
+                            across[c, f], across[other, g] = other, c
                         break
             else:
                 bucket[free[face[0]]] = n_faces * c + f
                 free[face[0]] += 1
-    return mates
+    return across
 
 
 @njit(cache=True)
@@ -213,7 +213,7 @@ def _cells_of_nodes(offsets, nodes, n_nodes):  # type: ignore[no-untyped-def]
 def _sharing_keys(meshfree, offsets, nodes, start, cells, keys):  # type: ignore[no-untyped-def]
     """The number of pairs of a mesh-free cell and a solid or lower mesh-free cell that share enough nodes.
 
-    Fills `keys` with their keys unless it is empty.
+    Fills `keys` with the keys of these pairs unless `keys` is empty.
     """
     n_cells = len(offsets) - 1
     solid = np.flatnonzero(~meshfree)
@@ -250,13 +250,13 @@ def _root(tree, cell):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _forest(mates, pairs, n_cells):  # type: ignore[no-untyped-def]
-    """Parents (n_cells,) of a union-find forest: one tree for each piece of the graph, the root its own parent."""
+def _forest(across, pairs, n_cells):  # type: ignore[no-untyped-def]
+    """Parents (n_cells,) of a union-find forest with one tree for each connected component of the graph."""
     tree = np.arange(n_cells)
-    for c in range(len(mates)):
-        for mate in mates[c]:
-            if mate >= 0:
-                tree[_root(tree, mate)] = _root(tree, c)
+    for c in range(len(across)):
+        for neighbour in across[c]:
+            if neighbour >= 0:
+                tree[_root(tree, neighbour)] = _root(tree, c)
     for i in range(len(pairs)):
         tree[_root(tree, pairs[i, 1])] = _root(tree, pairs[i, 0])
     return tree
@@ -264,7 +264,7 @@ def _forest(mates, pairs, n_cells):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _bridges(tree, start, cells, bridges):  # type: ignore[no-untyped-def]
-    """Fills `bridges` with pairs of cells that have a node, but no way through the graph, in common; their number."""
+    """Fills `bridges` with pairs of cells of different components with a common node; returns the number of pairs."""
     n = 0
     for node in range(len(start) - 1):
         for i in range(start[node] + 1, start[node + 1]):
@@ -278,8 +278,8 @@ def _bridges(tree, start, cells, bridges):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _weights(offsets, nodes, pairs, n_touching):  # type: ignore[no-untyped-def]
-    """The weight of each pair, at least 1: each node that both cells touch counts the more, the fewer cells it has."""
-    # A node inside a block has 8 hexahedra, and a face 4 nodes.
+    """The weight of each pair, at least 1; see `cell_graph`."""
+    # A node inside a block of hexahedra has 8 cells; a face has 4 nodes.
     unit = FACE_WEIGHT / (4 / 7)
     weights = np.empty(len(pairs), np.int64)
     for i in range(len(pairs)):
@@ -295,12 +295,12 @@ def _weights(offsets, nodes, pairs, n_touching):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _compressed_rows(mates, pairs, pair_weights, n_cells):  # type: ignore[no-untyped-def]
-    """The rows (xadj, adjncy, weights) of cells joined by faces and of the other pairs."""
+def _compressed_rows(across, pairs, pair_weights, n_cells):  # type: ignore[no-untyped-def]
+    """The graph (xadj, adjncy, weights) of neighbours across faces and of pairs."""
     xadj = np.zeros(n_cells + 1, np.int64)
-    for c in range(len(mates)):
-        for mate in mates[c]:
-            xadj[c + 1] += mate >= 0
+    for c in range(len(across)):
+        for neighbour in across[c]:
+            xadj[c + 1] += neighbour >= 0
     for i in range(len(pairs)):
         xadj[pairs[i, 0] + 1] += 1
         xadj[pairs[i, 1] + 1] += 1
@@ -308,10 +308,10 @@ def _compressed_rows(mates, pairs, pair_weights, n_cells):  # type: ignore[no-un
     free = xadj[:-1].copy()
     adjncy = np.empty(xadj[-1], np.int64)
     weights = np.empty(xadj[-1], np.int64)
-    for c in range(len(mates)):
-        for mate in mates[c]:
-            if mate >= 0:
-                adjncy[free[c]], weights[free[c]] = mate, FACE_WEIGHT
+    for c in range(len(across)):
+        for neighbour in across[c]:
+            if neighbour >= 0:
+                adjncy[free[c]], weights[free[c]] = neighbour, FACE_WEIGHT
                 free[c] += 1
     for i in range(len(pairs)):
         a, b = pairs[i]

@@ -1,4 +1,4 @@
-"""Cuts the graph of cells into parts of equal cost with METIS (Karypis and Kumar 1998)."""
+"""Partition the graph of cells into parts of equal cost with METIS (Karypis and Kumar 1998)."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ from numpy.typing import NDArray
 
 from partition.graph import CellGraph
 
-#: Tries of every bisection, of which METIS keeps the best: four cut 4 % fewer nodes than one, eight hardly fewer.
-TRIES = 4
+#: Attempts at each bisection; METIS keeps the best. Four attempts give 4 % fewer halo nodes than one; eight give the
+#: same.
+N_CUTS = 4
 
-#: METIS counts in integers: the cost of the cheapest cell in them, hence costs are right to 0.5 %.
+#: Integer cost of the cheapest cell: METIS needs integers. The rounding error is at most 0.5 %.
 COST_UNITS = 100
 
 
 def cut(graph: CellGraph, n_parts: int, costs: NDArray[np.float64], seed: int = 0) -> NDArray[np.int32]:
-    """The part of each cell, (n_cells,): parts of equal cost that few edges join.
+    """The part of each cell, (n_cells,): parts of equal cost with few edges between them.
 
-    `costs` (n_cells,) are those of the cells, in any unit. The same graph, costs and seed give the same parts. METIS
-    bisects again and again, each time to 0.1 % or to two cells, whichever is more. ValueError where there are fewer
-    cells than parts or a cost is not positive.
+    costs: (n_cells,), in any unit. Equal input gives equal parts. METIS bisects recursively; the costs of the halves
+    differ by up to 0.1 % or two cells, whichever is more. ValueError if there are fewer cells than parts, or a cost is
+    not positive.
     """
     if n_parts < 1:
         raise ValueError(f"cannot cut into {n_parts} parts: at least 1 is needed")
@@ -42,15 +43,15 @@ def cut(graph: CellGraph, n_parts: int, costs: NDArray[np.float64], seed: int = 
         eweights=None if graph.edge_weights is None else graph.edge_weights.astype(integer, copy=False),
         # METIS's k-way scheme can keep parts connected, but makes 5 to 40 % more halo nodes and 0.5 % imbalance.
         recursive=True,
-        options=pymetis.Options(seed=seed, ncuts=TRIES),
+        options=pymetis.Options(seed=seed, ncuts=N_CUTS),
     ).vertex_part
     return _without_empty_parts(np.array(part, dtype=np.int32), cost, n_parts)
 
 
 def _without_empty_parts(part: NDArray[np.int32], cost: NDArray[np.integer], n_parts: int) -> NDArray[np.int32]:
-    """Gives each empty part the last cell of the dearest part that has more than one."""
+    """Moves a cell into each empty part: the last cell of the most expensive part with more than one cell."""
     for empty in np.flatnonzero(np.bincount(part, minlength=n_parts) == 0):
         size = np.bincount(part, minlength=n_parts)
-        dearest = np.argmax(np.where(size > 1, np.bincount(part, cost, minlength=n_parts), 0))
-        part[np.flatnonzero(part == dearest)[-1]] = empty
+        largest = np.argmax(np.where(size > 1, np.bincount(part, cost, minlength=n_parts), 0))
+        part[np.flatnonzero(part == largest)[-1]] = empty
     return part

@@ -1,4 +1,4 @@
-"""The contents of each part: cells, nodes, neighbours and shared nodes; and figures of a partition's quality."""
+"""Tables of the parts (cells, nodes, neighbours, shared nodes), and figures of the quality of a partition."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from partition.graph import Block, CellGraph, connectivity
 
 @dataclass(frozen=True, slots=True)
 class PartTables:
-    """All parts one after another; offsets say where each begins. Global node and cell numbers.
+    """Tables of all parts, part after part, in global numbers; offsets are the starts of the parts.
 
-    A cell is in one part. A node is in each part whose cells touch it; the lowest of these owns it.
+    A cell is in one part. A node is in each part with a cell that touches the node; the lowest of these parts owns the
+    node.
     """
 
     n_parts: int
@@ -24,7 +25,7 @@ class PartTables:
     cell_offsets: NDArray[np.int64]  # (n_parts + 1,), into cells
     nodes: NDArray[np.int64]  # (sum of nodes,), by part, ascending in each
     node_offsets: NDArray[np.int64]  # (n_parts + 1,), into nodes
-    owned_offsets: NDArray[np.int64]  # (n_parts + 1,), running number of nodes that the parts own
+    owned_offsets: NDArray[np.int64]  # (n_parts + 1,), cumulative number of owned nodes
     neighbours: NDArray[np.int32]  # (sum of neighbours,), parts, by part, ascending in each
     neighbour_offsets: NDArray[np.int64]  # (n_parts + 1,), into neighbours
     shared: NDArray[np.int64]  # (sum of shared nodes,), by part and neighbour, ascending in each
@@ -32,7 +33,7 @@ class PartTables:
 
 
 def tables(blocks: Sequence[Block], part: NDArray[np.int32], n_parts: int) -> PartTables:
-    """The tables of a partition `part` (n_cells,) of the cells of all blocks. Nodes without a cell are in no part."""
+    """The tables of a partition; part: (n_cells,) part of each cell. Nodes without a cell are in no part."""
     offsets, cell_nodes, n_nodes = connectivity(blocks)
     cells = np.argsort(part, kind="stable")
     cell_offsets = _offsets(np.bincount(part, minlength=n_parts))
@@ -53,7 +54,7 @@ def tables(blocks: Sequence[Block], part: NDArray[np.int32], n_parts: int) -> Pa
     owned = np.bincount(border_parts[first], minlength=n_parts) + counts
     owned -= np.bincount(border_parts, minlength=n_parts)
 
-    # Each copy of a border node meets all copies of that node, which lie side by side.
+    # Pair each copy of a border node with all copies of the same node, which are adjacent after sorting.
     copies = n_touching[border_nodes]
     me = np.repeat(np.arange(len(border_nodes)), copies)
     start = np.maximum.accumulate(np.where(first, np.arange(len(border_nodes)), 0))
@@ -78,18 +79,18 @@ def tables(blocks: Sequence[Block], part: NDArray[np.int32], n_parts: int) -> Pa
 
 
 def _firsts(ascending: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Where a value differs from the one before it."""
+    """Whether each value differs from the previous value."""
     return np.concatenate([[True], ascending[1:] != ascending[:-1]])[: len(ascending)]
 
 
 def _offsets(counts: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Where each of so many items begins, and the last ends: (len(counts) + 1,)."""
+    """Cumulative sums of the counts, from 0: (len(counts) + 1,)."""
     return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
 
 
 @njit(cache=True)
 def _touched_nodes(offsets, cell_nodes, cells, cell_offsets, n_nodes, nodes):  # type: ignore[no-untyped-def]
-    """The number of nodes that each part's cells touch; fills `nodes` with them by part, unless it is empty."""
+    """The number of nodes of each part; fills `nodes` with these nodes, part after part, unless `nodes` is empty."""
     last = np.full(n_nodes, -1)
     counts = np.zeros(len(cell_offsets) - 1, np.int64)
     n = 0
@@ -107,15 +108,15 @@ def _touched_nodes(offsets, cell_nodes, cells, cell_offsets, n_nodes, nodes):  #
 
 @dataclass(frozen=True, slots=True)
 class PartFigures:
-    """How good a partition is, part by part."""
+    """Figures of the quality of a partition, (n_parts,) each."""
 
-    cells_of: Mapping[str, NDArray[np.int64]]  # cells (n_parts,) of each block, by the block's name
-    cost: NDArray[np.float64]  # (n_parts,), in the unit of the cells' costs
-    nodes: NDArray[np.int64]  # (n_parts,), shared ones included
-    halo_nodes: NDArray[np.int64]  # (n_parts,), nodes that other parts touch too
-    sent_nodes: NDArray[np.int64]  # (n_parts,), sent in an exchange: halo nodes, once to each part that has them
-    neighbours: NDArray[np.int64]  # (n_parts,)
-    cut: NDArray[np.int64] | None  # (n_parts,), edges of the graph that leave the part
+    cells_of: Mapping[str, NDArray[np.int64]]  # cells of each block, by the name of the block
+    cost: NDArray[np.float64]  # in the unit of the costs of the cells
+    nodes: NDArray[np.int64]  # including shared nodes
+    halo_nodes: NDArray[np.int64]  # nodes that are also in other parts
+    sent_nodes: NDArray[np.int64]  # sum over the neighbours of the nodes sent to each
+    neighbours: NDArray[np.int64]
+    cut: NDArray[np.int64] | None  # edges of the graph between the part and other parts
 
     @property
     def cells(self) -> NDArray[np.int64]:
@@ -124,11 +125,11 @@ class PartFigures:
 
     @property
     def balance(self) -> float:
-        """Cost of the dearest part over the mean: the time of a step over that of a perfect partition."""
+        """Largest cost over mean cost: the time of a step relative to the time with equal costs."""
         return float(self.cost.max() / self.cost.mean())
 
     def describe(self, most: int = 32) -> str:
-        """A table with a line for each part, for at most `most` parts, then the mean and the largest, and a summary."""
+        """A table with one line for each part (unless there are more than `most`), mean, maximum, and a summary."""
         columns = {
             "cells": self.cells,
             **self.cells_of,
@@ -157,9 +158,9 @@ class PartFigures:
 def figures(
     tables: PartTables, costs: NDArray[np.float64], sizes: Mapping[str, int], graph: CellGraph | None = None
 ) -> PartFigures:
-    """Figures of a partition whose cells cost `costs` (n_cells,); cut edges with the graph.
+    """Figures of a partition; with cut edges if the graph is given.
 
-    `sizes` are the numbers of cells of the blocks, by name, in order.
+    costs: (n_cells,), costs of the cells; sizes: number of cells of each block, by name, in the order of the blocks.
     """
     part = np.empty(len(tables.cells), dtype=np.int32)
     part[tables.cells] = np.repeat(np.arange(tables.n_parts, dtype=np.int32), np.diff(tables.cell_offsets))

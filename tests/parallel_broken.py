@@ -1,4 +1,4 @@
-"""Under mpirun: runs a deck that one rank breaks on its way, and notes when each rank ends. DECK DIR WAY"""
+"""Under mpirun: runs a deck, breaks the state of one rank, and records the times of events. DECK DIRECTORY FAULT"""
 
 from __future__ import annotations
 
@@ -14,51 +14,48 @@ from mpitled.errors import UnstableError
 from mpitled.parallel.halo import World
 from mpitled.solver.run import Run
 
-BREAKS, AT = 2, 0.3  # the rank that does, and the share of the load at which
+RANK, SHARE = 2, 0.3  # the rank with the fault, and the share of the load after which the fault is made
 
 
-def step_too_long(run: Run, node: int) -> None:
-    """As if the step were 100 times as long, on this rank."""
-    run.integrator.state.dt2_over_m *= 1e4
+def break_state(run: Run, fault: str) -> None:
+    """Make a fault; for two faults at a free node that no other rank has."""
+    state, rows = run.integrator.state, run.sub.rows
+    candidates = np.ones(run.sub.n_nodes, bool)
+    for _, nodes in run.sub.shared:
+        candidates[nodes] = False
+    candidates[rows.local(rows.prescribed_dofs // 3)] = False
+    node = int(np.argmax(candidates))
+    if fault == "step_too_long":  # by a factor of 100
+        state.dt2_over_m *= 1e4
+    elif fault == "not_a_number":
+        state.u[0, node] = np.nan
+    else:  # inverted_cell
+        state.u[0, node] += np.ptp(rows.read("points")[:, 0])
 
 
-def not_a_number(run: Run, node: int) -> None:
-    """A displacement that is no number."""
-    run.integrator.state.u[0, node] = np.nan
+def main(deck: str, directory: Path, fault: str) -> None:
+    world, events, check, check_and_output = World(), {}, Run._check, Run._check_and_output
 
-
-def inverted_cell(run: Run, node: int) -> None:
-    """A node on the other side of its cells."""
-    run.integrator.state.u[0, node] += np.ptp(run.sub.rows.read("points")[:, 0])
-
-
-def main(deck: str, directory: Path, way: str) -> None:
-    world, ends, check, check_and_output = World(), {}, Run._check, Run._check_and_output
-
-    def watched(run: Run) -> None:
+    def recorded_check(run: Run) -> None:
         try:
             check(run)
         except UnstableError:
-            ends["detected"] = time.time()
+            events["detected"] = time.time()
             raise
 
     def broken(run: Run) -> bool:
-        ahead = check_and_output(run)  # sets the right masses
-        if world.rank == BREAKS and run.integrator.state.share > AT and "broken" not in ends:
-            ends["broken"] = time.time()
-            lonely = np.ones(run.sub.n_nodes, bool)  # what no other rank has, and nothing prescribes
-            for _, nodes in run.sub.shared:
-                lonely[nodes] = False
-            lonely[run.sub.rows.local(run.sub.rows.prescribed_dofs // 3)] = False
-            globals()[way](run, int(np.flatnonzero(lonely)[0]))
-        return ahead
+        continues = check_and_output(run)  # sets the masses, which the fault changes
+        if world.rank == RANK and run.integrator.state.share > SHARE and "broken" not in events:
+            events["broken"] = time.time()
+            break_state(run, fault)
+        return continues
 
-    Run._check, Run._check_and_output = watched, broken  # type: ignore[method-assign]
+    Run._check, Run._check_and_output = recorded_check, broken  # type: ignore[method-assign]
     try:
         cli.main(["run", "-q", deck, "--out", str(directory)])
     except SystemExit as end:
-        ends |= {"status": end.code, "ended": time.time()}
-        (directory / f"rank_{world.rank}.json").write_text(json.dumps(ends))
+        events |= {"status": end.code, "ended": time.time()}
+        (directory / f"rank_{world.rank}.json").write_text(json.dumps(events))
         raise
 
 

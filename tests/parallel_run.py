@@ -1,4 +1,4 @@
-"""Under mpirun: runs a deck and sees that all copies of a shared node have the same bits. DECK DIR"""
+"""Under mpirun: runs a deck and compares the bits of all copies of shared nodes. DECK DIRECTORY"""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from mpitled.parallel.halo import World
 
 def main(deck: Path, directory: Path) -> None:
     world = World()
-    loops = []
+    runs = []
 
-    class Watched(job.Run):
+    class Recorded(job.Run):
         def __init__(self, *arguments: object) -> None:
             super().__init__(*arguments)  # type: ignore[arg-type]
-            loops.append(self)
+            runs.append(self)
 
-    job.Run = Watched  # type: ignore[misc]
+    job.Run = Recorded  # type: ignore[misc]
     job.run(load_deck(deck), directory, world, quiet=True)
-    state, shared = loops[0].integrator.state, loops[0].sub.shared
+    state, shared = runs[0].integrator.state, runs[0].sub.shared
     compared = 0
     for values in (state.u, state.u_prev, np.atleast_2d(state.dt2_over_m)):
-        mine = {rank: np.ascontiguousarray(values[:, nodes]) for rank, nodes in shared}
-        theirs = {rank: np.empty_like(block) for rank, block in mine.items()}
-        requests = [world.comm.Irecv(block, rank) for rank, block in theirs.items()]
-        requests += [world.comm.Isend(block, rank) for rank, block in mine.items()]
+        sent = {rank: np.ascontiguousarray(values[:, nodes]) for rank, nodes in shared}
+        received = {rank: np.empty_like(block) for rank, block in sent.items()}
+        requests = [world.comm.Irecv(block, rank) for rank, block in received.items()]
+        requests += [world.comm.Isend(block, rank) for rank, block in sent.items()]
         for request in requests:
             request.Wait()
-        for rank, block in mine.items():
-            assert block.tobytes() == theirs[rank].tobytes(), f"ranks {world.rank} and {rank} differ"
+        for rank, block in sent.items():
+            assert block.tobytes() == received[rank].tobytes(), f"ranks {world.rank} and {rank} differ"
             compared += block.size
     total = int(world.gather([compared])[:, 0].sum())
     if world.leads:

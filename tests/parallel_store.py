@@ -1,6 +1,6 @@
-"""Writes results on every rank; started by test_store.py as `mpirun -n N python parallel_store.py MODEL DIRECTORY END`.
+"""Under mpirun: writes results. MODEL DIRECTORY END
 
-END is "close", "abandon" or "kill" (rank 0 dies by SIGKILL in the middle of the third of four frames).
+END is "close", "abandon" or "kill" (SIGKILL to rank 0 in the middle of the third of four frames).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ N_FRAMES = 4
 
 
 def frame(part: PartRows, k: int) -> tuple[dict[str, Any], dict[str, Any], dict[str, float]]:
-    """Point data, cell data and series of frame k, as functions of global numbers and places."""
+    """Point data, cell data and series of frame k, as functions of global numbers and positions."""
     nodes, points = part.nodes[part.owned], part.read("points")[part.owned]
     cloud = part.blocks[1]
     points = np.concatenate([points, cloud.read("points")])

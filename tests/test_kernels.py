@@ -326,3 +326,15 @@ def test_kinetic_energy_is_that_of_the_middle_of_two_half_steps_but_at_prescribe
     velocity = (u - u_prev)[:, :n] / dt - np.where(prescribed, 0, 0.5 * dt * 1e6 * f[:, :n] / m)
     found = kernels.kinetic_energy(u, u_prev, 1e6 * f, dt**2 / m, counted, held)
     assert found == pytest.approx(0.5 * (counted * m * velocity**2).sum(), rel=1e-12)
+
+
+def test_a_power_iteration_sums_over_owned_nodes():
+    rng, n, reach, size = np.random.default_rng(8), 40, 1e-3, 0.7
+    mode, f, at_rest = rng.normal(size=(3, 3, n))
+    dt2_over_m, owned, renewed = rng.uniform(1, 2, (1, n)), rng.random(n) < 0.7, mode.copy()
+    old, new, largest = kernels.power_iteration(renewed, f, at_rest, dt2_over_m, owned, reach, size)
+    response = (f - at_rest) / reach
+    assert renewed == pytest.approx(dt2_over_m * response, rel=1e-12)
+    assert old == pytest.approx((response * mode)[:, owned].sum() / size, rel=1e-12)
+    assert new == pytest.approx((response * renewed)[:, owned].sum(), rel=1e-12)
+    assert largest == np.abs(renewed).max()

@@ -1,4 +1,4 @@
-"""The graph of cells, its cut and the tables of parts, against closed forms and brute force."""
+"""The graph of cells, its partition and the tables of the parts, compared with closed forms and brute force."""
 
 import resource
 import sys
@@ -24,7 +24,7 @@ def solid(hexahedra: NDArray[np.int64]) -> Block:
 
 
 def mixed(n: int, core: float = 0.5, nodes: int = 8, share: float = 1.0) -> list[Block]:
-    """Hexahedra and support domains: n^3 cells whose core is a random cloud with 8 `share` points a cell."""
+    """n^3 cells: hexahedra, and in the core a random cloud with 8 `share` support domains in place of each cell."""
     rng = np.random.default_rng(1)
     hexahedra, points = structured_hexahedra((n, n, n)), grid_points((n, n, n), (1.0, 1.0, 1.0))
     centres = points[hexahedra].mean(axis=1)
@@ -48,19 +48,19 @@ def sizes(blocks: list[Block]) -> dict[str, int]:
 
 
 def edges(graph: CellGraph) -> set[tuple[int, int]]:
-    """Every entry of the rows, as a pair; fails if one is there twice."""
+    """Pairs of all entries of the rows, without repetition."""
     rows = np.repeat(np.arange(graph.n_cells), np.diff(graph.xadj))
     pairs = list(zip(rows.tolist(), graph.adjncy.tolist(), strict=True))
     assert len(set(pairs)) == len(pairs)
     return set(pairs)
 
 
-def pieces(graph: CellGraph) -> int:
+def n_components(graph: CellGraph) -> int:
     matrix = csr_matrix((np.ones(len(graph.adjncy)), graph.adjncy, graph.xadj), shape=(graph.n_cells, graph.n_cells))
     return int(connected_components(matrix, directed=False)[0])
 
 
-def test_hexahedra_are_joined_by_faces_whatever_their_numbers():
+def test_edges_of_hexahedra_are_faces_in_any_numbering():
     """Inner faces of an nx x ny x nz block: (nx - 1) ny nz and so on."""
     nx, ny, nz = 5, 4, 3
     block = structured_hexahedra((nx, ny, nz))
@@ -80,14 +80,14 @@ def test_hexahedra_are_joined_by_faces_whatever_their_numbers():
 
 
 @pytest.mark.parametrize("nodes", [8, 20])
-def test_support_domains_are_joined_to_the_nearest_and_to_those_that_share_nodes(nodes):
+def test_edges_of_support_domains_join_nearest_domains_and_cells_with_common_nodes(nodes):
     blocks = mixed(6, nodes=nodes, share=0.4)
     graph = cell_graph(blocks)
     found = edges(graph)
     hexahedra, domains, points = blocks[0].nodes, blocks[1].nodes, blocks[1].points
     n = len(hexahedra)
     assert all((b, a) in found and a != b for a, b in found)
-    assert pieces(graph) == 1
+    assert n_components(graph) == 1
     assert graph.edge_weights.min() >= 1
 
     nearest = cKDTree(points).query(points, k=7)[1]
@@ -100,8 +100,8 @@ def test_support_domains_are_joined_to_the_nearest_and_to_those_that_share_nodes
     assert found == expected | {(b, a) for a, b in expected} | hexahedra_only
 
 
-def test_graph_is_in_one_piece_where_the_mesh_is():
-    """Two hexahedra at one edge have no face in common, and a third touches neither."""
+def test_graph_is_connected_where_the_mesh_is():
+    """Two hexahedra share an edge but no face, and a third hexahedron is separate."""
     shared_edge = np.array([[0, 1, 2, 3, 4, 5, 6, 7], [2, 8, 9, 10, 6, 11, 12, 13], np.arange(20, 28)])
     graph = cell_graph([solid(shared_edge)])
     assert edges(graph) == {(0, 1), (1, 0)}
@@ -121,7 +121,7 @@ def test_parts_have_equal_cost_and_their_tables_agree(scene, n_parts):
 
     found = tables(blocks, part, n_parts)
     quality = figures(found, costs(blocks), sizes(blocks), graph)
-    # METIS leaves a bisection within 0.1 % or two mean cells; halved again and again, these add up to four cells.
+    # The imbalance of a bisection is at most 0.1 % or two cells; recursive bisection adds up to four cells.
     mean = quality.cost.mean()
     assert quality.cost.max() <= mean * 1.001 ** np.ceil(np.log2(n_parts)) + 4 * max(COSTS)
     check_tables(found, blocks, part, n_parts)
@@ -129,23 +129,21 @@ def test_parts_have_equal_cost_and_their_tables_agree(scene, n_parts):
     rows = np.repeat(np.arange(graph.n_cells), np.diff(graph.xadj))
     assert quality.cut.sum() == np.count_nonzero(part[rows] != part[graph.adjncy])
     assert quality.cost.sum() == pytest.approx(costs(blocks).sum(), rel=1e-12)
-    text = quality.describe()
-    assert len(text.splitlines()) == n_parts + 4
-    assert f"{n_parts} parts: balance {quality.balance:.4f}" in text
+    assert len(quality.describe().splitlines()) == n_parts + 4
 
 
 def check_tables(found: PartTables, blocks: list[Block], part: NDArray[np.int32], n_parts: int) -> None:
-    """The tables against sets of nodes, part by part."""
+    """Compare the tables of each part with sets of nodes."""
     cells = [cell for block in blocks for cell in block.nodes.tolist()]
-    mine = [sorted({node for c in np.flatnonzero(part == p) for node in cells[c]}) for p in range(n_parts)]
-    owner = {node: p for p in reversed(range(n_parts)) for node in mine[p]}
+    of_part = [sorted({node for c in np.flatnonzero(part == p) for node in cells[c]}) for p in range(n_parts)]
+    owner = {node: p for p in reversed(range(n_parts)) for node in of_part[p]}
     for p in range(n_parts):
         own = slice(*found.cell_offsets[p : p + 2])
         assert found.cells[own].tolist() == np.flatnonzero(part == p).tolist()
         own = slice(*found.node_offsets[p : p + 2])
-        assert found.nodes[own].tolist() == mine[p]
+        assert found.nodes[own].tolist() == of_part[p]
         assert np.diff(found.owned_offsets)[p] == sum(of == p for of in owner.values())
-        expected = {q: sorted(set(mine[p]) & set(mine[q])) for q in range(n_parts) if q != p}
+        expected = {q: sorted(set(of_part[p]) & set(of_part[q])) for q in range(n_parts) if q != p}
         expected = {q: nodes for q, nodes in expected.items() if nodes}
         links = range(*found.neighbour_offsets[p : p + 2])
         assert found.neighbours[links.start : links.stop].tolist() == list(expected)
@@ -157,7 +155,7 @@ def check_tables(found: PartTables, blocks: list[Block], part: NDArray[np.int32]
 
 
 def test_parts_without_one_kind_of_cell():
-    """Both occur where the core is several parts wide."""
+    """Both kinds of parts occur if the core is several parts wide."""
     blocks = mixed(10, core=0.7)
     part = cut(cell_graph(blocks), 32, costs(blocks))
     found = tables(blocks, part, 32)
@@ -175,54 +173,54 @@ def test_one_part_needs_no_metis(monkeypatch):
     part = cut(graph, 1, costs(blocks))
     assert part.dtype == np.int32
     assert part.tolist() == [0] * graph.n_cells
-    found = tables(blocks, part, 1)
-    check_tables(found, blocks, part, 1)
+    check_tables(tables(blocks, part, 1), blocks, part, 1)
     with pytest.raises(ImportError):
         cut(graph, 2, costs(blocks))
 
 
 def test_as_many_parts_as_cells_but_no_more():
-    """METIS leaves a part of 27 single cells empty; none is in the end."""
+    """METIS leaves one of 27 parts empty; `cut` moves a cell into this part."""
     block = structured_hexahedra((3, 3, 3))
     graph = cell_graph([solid(block)])
     assert sorted(cut(graph, 27, np.ones(27))) == list(range(27))
-    with pytest.raises(ValueError, match="cannot cut 27 cells into 28 parts"):
-        cut(graph, 28, np.ones(27))
-    with pytest.raises(ValueError, match="cannot cut into 0 parts"):
-        cut(graph, 0, np.ones(27))
-    with pytest.raises(ValueError, match="costs must be positive"):
-        cut(graph, 2, np.arange(27.0))
+    for n_parts, cost, message in (
+        (28, np.ones(27), "cannot cut 27 cells into 28 parts"),
+        (0, np.ones(27), "cannot cut into 0 parts"),
+        (2, np.arange(27.0), "costs must be positive"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            cut(graph, n_parts, cost)
 
 
 def test_edge_weights_leave_fewer_halo_nodes():
-    """A dense cloud has many more edges a node than hexahedra: weighed alike, METIS cuts around it, not through."""
+    """A dense cloud has more edges per node than hexahedra: with equal weights METIS avoids to cut the cloud."""
     blocks = mixed(16)
     graph = cell_graph(blocks)
     halo = {}
-    for name, weighed in {"nets": graph, "alike": replace(graph, edge_weights=None)}.items():
-        parts = [cut(weighed, 2, costs(blocks), seed) for seed in range(3)]
+    for name, weighted in {"weights": graph, "equal": replace(graph, edge_weights=None)}.items():
+        parts = [cut(weighted, 2, costs(blocks), seed) for seed in range(3)]
         halo[name] = sum(len(tables(blocks, part, 2).shared) for part in parts)
-    assert halo["nets"] < halo["alike"]
+    assert halo["weights"] < halo["equal"]
 
 
 @pytest.mark.study
 def test_four_million_hexahedra():
-    """Seconds and peak memory of graph, cut and tables; run with -s to see them, alone in a process."""
-    tables_of_few = structured_hexahedra((4, 4, 4))
-    tables([solid(tables_of_few)], cut(cell_graph([solid(tables_of_few)]), 2, np.ones(64)), 2)
+    """Time and peak memory of graph, cut and tables. Run this test alone, with -s to print the numbers."""
+    small = structured_hexahedra((4, 4, 4))  # compiles
+    tables([solid(small)], cut(cell_graph([solid(small)]), 2, np.ones(64)), 2)
     block = structured_hexahedra((160, 160, 157))
-    alike = np.ones(len(block))
+    equal = np.ones(len(block))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     start = time.perf_counter()
     graph = cell_graph([solid(block)])
     print(f"\ngraph {time.perf_counter() - start:.1f} s")
-    part = cut(graph, 2, alike)
+    part = cut(graph, 2, equal)
     print(f"cut {time.perf_counter() - start:.1f} s")
     found = tables([solid(block)], part, 2)
     seconds = time.perf_counter() - start
     peak = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024 / len(block)
     print(f"tables {seconds:.1f} s, peak {peak:.0f} bytes a cell")
-    print(figures(found, alike, {"hexahedra": len(block)}, graph).describe())
-    # Under 3 minutes and 1 KB a cell together with building the model: half of both is ours at most.
+    print(figures(found, equal, {"hexahedra": len(block)}, graph).describe())
+    # At most half of 3 minutes and 1 KB a cell, the limits for the model and its partition together.
     assert seconds < 90
     assert peak < 500

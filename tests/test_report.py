@@ -448,7 +448,7 @@ def test_info_knows_the_files_around_a_run(tmp_path):
         "a.k": f"is a mesh: mpitled check {tmp_path / 'a.k'}",
         "report.json": f"is the report of a run: mpitled report {tmp_path}",
         "a.csv": "is a table of text; open it in an editor or a spreadsheet",
-        "a.png": "is there to be looked at; open it in a viewer or a browser",
+        "a.png": "is a picture or a page; open it in a viewer or a browser",
     }.items():
         (tmp_path / name).write_text("anything")
         assert complaint(mpitled("info", tmp_path / name, status=2)) == f"mpitled: {tmp_path / name}: {words}"

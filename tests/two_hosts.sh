@@ -1,17 +1,17 @@
 #!/usr/bin/env bash
-# Two hosts on one machine: network namespaces TAGa and TAGb with a cable (veth) between them, so that ranks talk over TCP.
-#   two_hosts.sh up TAG            makes them (root)
-#   two_hosts.sh run TAG WORDS...  mpirun of a command with one rank on each, started on the first
-#   two_hosts.sh cut TAG           takes the cable out
-#   two_hosts.sh down TAG          ends what is left on them, and removes them
-# A cable that is cut says nothing. So the launcher asks the other host every second (keep-alive), and the hosts give up
-# what is not acknowledged after some tries (tcp_retries2): a cluster's defaults are 5 and 15 minutes.
+# Two hosts on one machine: network namespaces TAGa and TAGb with a cable (veth), so that ranks communicate over TCP.
+#   two_hosts.sh up TAG            creates the hosts (root)
+#   two_hosts.sh run TAG WORDS...  starts a command by mpirun on the first host, with one rank on each host
+#   two_hosts.sh cut TAG           cuts the cable
+#   two_hosts.sh down TAG          kills the processes on the hosts and removes the hosts
+# The hosts detect a cut cable by timeouts only: keep-alive of the launcher (1 s here, 5 minutes by default) and retries
+# of TCP (tcp_retries2: 3 here; the default takes 15 minutes).
 set -euo pipefail
 verb=$1 tag=$2
 shift 2
 declare -A address=([a]=10.213.47.1 [b]=10.213.47.2)
 
-on() { # HOST WORDS...: a command on a host, which knows itself by that name
+on() { # HOST WORDS...: runs a command on a host, with the name of the host
     local host=$1
     shift
     exec ip netns exec "$tag$host" unshare --uts sh -c 'hostname "$0" && exec "$@"' "$tag$host" "$@"
@@ -35,11 +35,11 @@ run)
     chmod +x "$agent"
     net=(--mca pml ob1 --mca btl "tcp,self" --mca btl_tcp_if_include 10.213.47.0/30 --mca oob_tcp_if_include 10.213.47.0/30)
     net+=(--mca oob_tcp_keepalive_time 1 --mca oob_tcp_keepalive_intvl 1 --mca oob_tcp_keepalive_probes 3)
-    # Not exec: the agent's file goes when mpirun ends.
+    # A subshell, because exec would prevent the removal of the agent's file.
     (on a mpirun --host "${address[a]}:1,${address[b]}:1" --bind-to none --mca plm_rsh_agent "$agent" "${net[@]}" \
         -x PATH -x PYTHONPATH -x OMP_NUM_THREADS "$@")
     ;;
-agent) # mpirun's way to another host, in place of ssh
+agent) # mpirun's replacement of ssh
     for host in a b; do
         if [ "$1" = "${address[$host]}" ]; then
             shift

@@ -1,1 +1,1 @@
-"""Ranks: the part of the model on each, and what they exchange."""
+"""Parallel computing: ranks, the exchange of nodal values between ranks, and the subdomain of each rank."""

@@ -1,9 +1,10 @@
-"""One rank's part of the model in local numbers, packed as the kernels want it."""
+"""The part of the model on one rank in local numbers, with cells packed for the kernels."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from mpitled.cells.packing import LocalCells, PackedCells
 from mpitled.model import CellBlock
 from mpitled.store import PartBlock, PartRows
 
-#: What `solver.precision` means for the cells' arithmetic.
+#: Floating-point type of the arithmetic of cells for each `solver.precision`.
 PRECISIONS: dict[str, type[np.floating]] = {"double": np.float64, "single": np.float32}
 
 
@@ -23,23 +24,23 @@ PRECISIONS: dict[str, type[np.floating]] = {"double": np.float64, "single": np.f
 class Subdomain:
     """The part of the model on one rank, in local numbers and SI units.
 
-    A cell is on exactly one rank. A node is on every rank with a cell that touches it; all of these ranks move it
-    identically, and its owner alone writes it and counts it in sums. Local cells are numbered block after block.
+    A cell is on one rank. A node is on every rank with a cell that touches the node; these ranks compute the same
+    motion, and only the owner writes the node and adds it to sums. Local cells are numbered block after block.
     """
 
     rows: PartRows
-    #: Nodes and shape functions (n, k) at the integration points of each mesh-free block
+    #: Nodes (n, k) and shape functions (n, k) at the integration points of each mesh-free block.
     clouds: tuple[tuple[NDArray[np.uint32], NDArray[np.float64]], ...]
-    field_domains: NDArray[np.uint32]  # (n_field_nodes, k), nodes of the cell that gives the field at an EFG node
+    field_domains: NDArray[np.uint32]  # (n_field_nodes, k), nodes of the cell that interpolates at each field node
     n_nodes: int
     n_cells: int
-    packed: tuple[PackedCells, ...]  # the cells as the kernels take them, by kind and law
-    fixed: NDArray[np.uint32]  # dofs (3 node + direction) that stay where they are
+    packed: tuple[PackedCells, ...]  # input of the kernels, by kind and law
+    fixed: NDArray[np.uint32]  # dofs (3 node + direction) with displacement 0
     moving: NDArray[np.uint32]  # dofs that follow the loading curve
-    moving_full: NDArray[np.float64]  # (len(moving),), m at full load
-    moving_turns: NDArray[np.float64] | None  # (len(moving), 3), see `loading.rotation_path`; None: all straight
-    shared: tuple[tuple[int, NDArray[np.uint32]], ...]  # (rank, nodes shared with it), ranks ascending
-    precision: type[np.floating]  # of the cells' arithmetic
+    moving_full: NDArray[np.float64]  # (len(moving),), displacement at full load, m
+    moving_turns: NDArray[np.float64] | None  # (len(moving), 3), see `loading.rotation_path`; None: straight paths only
+    shared: tuple[tuple[int, NDArray[np.uint32]], ...]  # (rank, nodes shared with this rank), ascending ranks
+    precision: type[np.floating]  # of the arithmetic of cells
 
     @property
     def held(self) -> NDArray[np.uint32]:
@@ -47,15 +48,15 @@ class Subdomain:
         return np.concatenate([self.fixed, self.moving])
 
     def free(self) -> NDArray[np.bool_]:
-        """(3, n_nodes): whether a dof is free, and not prescribed."""
+        """(3, n_nodes): whether each dof is free."""
         free = np.ones((3, self.n_nodes), bool)
         free[self.held % 3, self.held // 3] = False
         return free
 
     def steepest_load(self) -> float:
-        """Largest gradient that the full load's speed, m per load, has in a cell of this rank whose free nodes rest.
+        """Largest velocity gradient of a cell of this rank when free nodes rest; velocity: m per unit of the full load.
 
-        It is by how much of its own size a cell next to moving nodes would be strained, if nothing gave way.
+        This is the strain of a cell next to moving nodes if its free nodes do not move.
         """
         rows, speed = self.rows, np.zeros((self.n_nodes, 3))
         points = rows.read("points")
@@ -75,17 +76,17 @@ class Subdomain:
                         gradients = block.gradients(points, cells[near], 0)
                     else:
                         gradients = block.gradients(points, cells, first)[near]
-                    found = np.einsum("cai,caj->cij", speed[cells[near]], gradients)
-                    steepest = max(steepest, float(np.sqrt((found**2).sum(axis=(1, 2)).max())))
+                    gradient = np.einsum("cai,caj->cij", speed[cells[near]], gradients)
+                    steepest = max(steepest, float(np.sqrt((gradient**2).sum(axis=(1, 2)).max())))
         return steepest
 
 
 def localise(
     rows: PartRows, hourglass: float, stabilisation: float, rule: str, precision: type[np.floating] = np.float64
 ) -> Subdomain:
-    """Local numbers and packed cells of a part; see `CellOptions`.
+    """The subdomain of a part; for the options see `CellOptions`.
 
-    Local nodes ascend with the global ones, so that nodes along a grid line stay consecutive.
+    Local numbers of nodes ascend with global numbers, so that nodes along a grid line are consecutive.
     """
 
     def local(nodes: NDArray[np.int64]) -> NDArray[np.uint32]:
@@ -93,8 +94,8 @@ def localise(
 
     def nodes_of(block: PartBlock) -> NDArray[np.uint32]:
         nodes = np.empty((block.n_own, block.n_nodes), np.uint32)
-        for first, some in block.chunks("nodes"):
-            nodes[first : first + len(some)] = local(some)
+        for first, chunk in block.chunks("nodes"):
+            nodes[first : first + len(chunk)] = local(chunk)
         return nodes
 
     points, options = rows.read("points"), CellOptions(hourglass, stabilisation, rule)
@@ -129,16 +130,14 @@ def localise(
         moving_turns=rows.rotation_paths[moves] if rotates.any() else None,
         shared=tuple(
             (int(rank), local(rows.shared[first:last]))
-            for rank, first, last in zip(
-                rows.neighbours, rows.shared_offsets[:-1], rows.shared_offsets[1:], strict=True
-            )
+            for rank, (first, last) in zip(rows.neighbours, pairwise(rows.shared_offsets), strict=True)
         ),
         precision=precision,
     )
 
 
 def cell_costs(points: NDArray[np.float64], blocks: Sequence[CellBlock]) -> NDArray[np.float64]:
-    """Cost (n_cells,) of each cell of a model in a step, relative to a box in a voxel run."""
+    """Cost (n_cells,) of each cell in a step, relative to a box in a voxel run; points: (n_nodes, 3), m."""
     costs = [np.full(len(block), block.kind.node_cost * block.nodes.shape[1]) for block in blocks]
     for block, of_block in zip(blocks, costs, strict=True):
         if block.kind is HEXAHEDRA:

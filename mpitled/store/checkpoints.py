@@ -16,6 +16,7 @@ from mpitled.errors import InputError, damaged
 from mpitled.hdf5 import open_file
 from mpitled.store.files import (
     AGAIN,
+    OneRank,
     attribute,
     check_free_space,
     collective,
@@ -32,9 +33,9 @@ from mpitled.store.files import (
 )
 from mpitled.store.partitions import PartRows
 
-#: Checkpoints of another layout are refused.
+#: Version of the layout. Checkpoints of another layout are refused.
 CHECKPOINT_LAYOUT = 2
-#: The last checkpoint of a run, and the one before it.
+#: File names of the last checkpoint of a run and of the previous checkpoint.
 CHECKPOINTS = ("checkpoint.h5", "checkpoint.previous.h5")
 
 
@@ -44,51 +45,47 @@ def write_checkpoint(
     part: PartRows,
     metadata: Mapping[str, Any],
     nodal: Mapping[str, NDArray[np.floating]],
-    own: Sequence[float],
+    rank_numbers: Sequence[float],
 ) -> None:
-    """Write a checkpoint. Once it is on disc it replaces the last one, which is renamed.
+    """Write a checkpoint to disc, rename the last checkpoint, and give the new checkpoint its name. Collective.
 
-    Collective. metadata: a value that JSON can hold, of rank 0; nodal: (n owned nodes, components) by name; own:
-    numbers of this rank. InputError if it cannot be written.
+    comm: mpi4py communicator, or None for one rank; metadata: JSON value, of rank 0; nodal: arrays (n_owned_nodes,
+    components) by name; rank_numbers: numbers of this rank, equally many on all ranks. InputError if writing fails.
     """
-    if comm is not None and comm.size == 1:
-        comm = None
+    comm = comm or OneRank()
     path, previous = (Path(directory) / name for name in CHECKPOINTS)
     new = path.with_name(f".{path.name}")
     transfer, shares = collective(comm), dict[str, int]()
     with writing(path):
         if part.part == 0:
             components = sum(values.shape[1] for values in nodal.values())
-            check_free_space(
-                path, 8 * part.n_nodes * (1 + components) + 8 * part.n_parts * len(own) + len(str(metadata))
-            )
-        # The latest format has checksums of its own for metadata.
+            size = 8 * part.n_nodes * (1 + components) + 8 * part.n_parts * len(rank_numbers) + len(str(metadata))
+            check_free_space(path, size)
+        # The latest format of HDF5 has checksums of its metadata.
         with create(new, comm, libver="latest") as file:
             file.attrs["layout"] = CHECKPOINT_LAYOUT
 
             def write(name: str, n_rows: int, first: int, values: NDArray[Any]) -> None:
-                made = make(file, name, (n_rows, *values.shape[1:]), values.dtype)
-                shares[name] = write_rows(made, first, values, 0, transfer)
+                dataset = make(file, name, (n_rows, *values.shape[1:]), values.dtype)
+                shares[name] = write_rows(dataset, first, values, 0, transfer)
 
             write("node", part.n_nodes, part.first_row, part.nodes[part.owned])
             for name, values in nodal.items():
                 write(f"nodal/{name}", part.n_nodes, part.first_row, values)
-            write("own", part.n_parts, part.part, np.array([own], np.float64))
-            every = [shares] if comm is None else comm.allgather(shares)
+            write("own", part.n_parts, part.part, np.array([rank_numbers], np.float64))
+            rank_shares = comm.allgather(shares)
             for name in shares:
-                file[name].attrs["checksum"] = checksum.total(of_rank[name] for of_rank in every)
-            write_json(file, "metadata", dict(metadata) if comm is None else comm.bcast(dict(metadata)))
+                file[name].attrs["checksum"] = checksum.total(of_rank[name] for of_rank in rank_shares)
+            write_json(file, "metadata", comm.bcast(dict(metadata)))
             file.flush()
         fsync(new)
-        if comm is not None:
-            comm.barrier()
+        comm.barrier()
         if part.part == 0:
             if path.exists():
                 os.replace(path, previous)
             os.replace(new, path)
             fsync(path.parent)
-        if comm is not None:
-            comm.barrier()
+        comm.barrier()
 
 
 def is_checkpoint(path: Path) -> bool:
@@ -99,7 +96,10 @@ def is_checkpoint(path: Path) -> bool:
 
 
 def checkpoint_contents(path: Path) -> dict[str, Any]:
-    """The metadata of a checkpoint. Reads all of it. InputError if it is damaged, or not of this layout."""
+    """The metadata of a checkpoint. Checks every checksum.
+
+    InputError if the file is damaged, no checkpoint, or a checkpoint of another layout.
+    """
     with open_file(path) as file, damaged(path, AGAIN):
         hdf5_validation.check_file(file, path, numbers=True)
         layout = attribute(file, "layout") if "metadata" in file and "node" in file else None
@@ -115,26 +115,27 @@ def checkpoint_contents(path: Path) -> dict[str, Any]:
 def read_checkpoint(
     path: Path, nodes: NDArray[np.int64]
 ) -> tuple[dict[str, NDArray[np.floating]], NDArray[np.float64]]:
-    """The nodal fields (n nodes, components) of a checkpoint by name, at nodes (ascending); the numbers of each rank.
+    """The nodal fields of a checkpoint by name, (len(nodes), components), and the numbers of each rank, (n_ranks, n).
 
-    The file has to be one that `checkpoint_contents` has read.
+    nodes: (n,) ascending global numbers. `checkpoint_contents` must have checked the file. InputError if the file is
+    damaged or lacks any of the nodes.
     """
     with open_file(path) as file, damaged(path, AGAIN):
         hdf5_validation.check_file(file, path, numbers=True)
-        found, rows = matching(file["node"], nodes, 1)
-        order = np.argsort(found)
-        if not np.array_equal(found[order], nodes):
-            raise ValueError("it is of other nodes")
+        stored, rows = matching(file["node"], nodes, 1)
+        order = np.argsort(stored)
+        if not np.array_equal(stored[order], nodes):
+            raise ValueError("the checkpoint lacks nodes of this part")
         names: list[str] = []
-        file["nodal"].visititems(lambda name, thing: names.append(name) if isinstance(thing, h5py.Dataset) else None)
+        file["nodal"].visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
         return {name: read_rows(file["nodal"][name], rows)[order] for name in names}, file["own"][...]
 
 
 def discard_checkpoints(directory: Path) -> bool:
-    """Remove the checkpoints of a run, if there are any; whether there were."""
+    """Remove the checkpoints of a run; False if there are none. InputError if a file cannot be removed."""
     paths = [Path(directory) / name for name in (f".{CHECKPOINTS[0]}", *CHECKPOINTS)]
-    found = [path for path in paths if path.exists()]
-    for path in found:
+    existing = [path for path in paths if path.exists()]
+    for path in existing:
         with writing(path):
             path.unlink()
-    return bool(found)
+    return bool(existing)

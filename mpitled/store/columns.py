@@ -1,4 +1,4 @@
-"""Tables of columns: results of many runs, and grids of integration points."""
+"""File layouts of tables: results of many runs, and grids of integration points."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ from mpitled.store.files import replacing
 
 
 def write_columns(path: Path, groups: Mapping[str, Mapping[str, Sequence[float | str]]]) -> None:
-    """Write tables, a group for each, completely or not at all. A column is of numbers, or of text if it has any."""
+    """Write tables of columns, one group each, atomically. A column with any text is a column of text.
+
+    InputError if the file cannot be written.
+    """
     with replacing(path) as temporary, h5py.File(temporary, "w", locking=False) as file:
         for name, columns in groups.items():
             group = file.create_group(name, track_order=True)
@@ -27,7 +30,10 @@ def write_columns(path: Path, groups: Mapping[str, Mapping[str, Sequence[float |
 
 
 def table_contents(path: Path) -> dict[str, dict[str, Any]]:
-    """Columns and number of rows of each table, by name; empty if the HDF5 file holds anything but tables."""
+    """Names of columns and number of rows of each table, by name; empty if the file holds other objects than tables.
+
+    InputError if the file is not valid HDF5.
+    """
     with open_file(path) as file, damaged(path, "make it anew"):
         hdf5_validation.check_file(file, path)
         tables = {}

@@ -16,12 +16,26 @@ from numpy.typing import NDArray
 from mpitled import checksum, resources
 from mpitled.errors import InputError
 
-#: Gap in bytes that is read rather than skipped: it takes as long as one more call of HDF5 (70 us at 3.5 GB/s).
+#: Gap between rows, bytes, that takes as long to read as one more call of HDF5 (70 us at 3.5 GB/s).
 _GAP_BYTES = 1 << 18
 #: Size of a temporary buffer in bytes: it fits into the cache.
 _BUFFER_BYTES = 1 << 22
-#: Remedies of damaged files.
+#: Remedies for damaged files.
 REBUILD, AGAIN = "build the model anew", "run the deck again"
+
+
+class OneRank:
+    """The communicator of a run without MPI: methods of mpi4py's `Comm` for one rank."""
+
+    rank, size = 0, 1
+
+    def barrier(self) -> None: ...
+
+    def bcast(self, value: Any) -> Any:
+        return value
+
+    def allgather(self, value: Any) -> list[Any]:
+        return [value]
 
 
 def hdf5_version() -> str:
@@ -62,7 +76,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Errors of the file system as an InputError that names the file."""
+    """Turn errors of the file system into an InputError that names the file."""
     try:
         yield
     except (OSError, RuntimeError) as error:
@@ -70,7 +84,10 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def check_free_space(path: Path, size: int) -> None:
-    """InputError if the disc has less free space than `size` bytes and HDF5's own: HDF5 fails badly on a full disc."""
+    """InputError if the disc has no space for `size` bytes of data and HDF5's metadata.
+
+    HDF5 may crash on a full disc.
+    """
     path = Path(path)
     resources.check_disc(
         size + size // 50 + (1 << 16), path.parent, path.name, "free some space, or give another folder"
@@ -78,7 +95,7 @@ def check_free_space(path: Path, size: int) -> None:
 
 
 def reserve(path: Path) -> None:
-    """Allocate the blocks of a file on disc: no later write into it can find the disc full."""
+    """Allocate the blocks of a file on disc, so that no later write into the file fails on a full disc."""
     descriptor = os.open(path, os.O_RDWR)
     try:
         os.posix_fallocate(descriptor, 0, os.fstat(descriptor).st_size)
@@ -87,7 +104,7 @@ def reserve(path: Path) -> None:
 
 
 def fsync(path: Path) -> None:
-    """Flush a file, or the names in a folder, to disc."""
+    """Flush a file, or the directory entries of a folder, to disc."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -96,16 +113,14 @@ def fsync(path: Path) -> None:
 
 
 def put(group: h5py.Group, name: str, values: Any) -> None:
-    """A dataset with its checksum."""
+    """Write a dataset with its checksum as an attribute."""
     dataset = group.create_dataset(name, data=values)
     dataset.attrs["checksum"] = checksum.total([checksum.share(np.asarray(values), 0)])
 
 
 def write_json(group: h5py.Group, name: str, value: Any) -> None:
-    """Write a dataset with a value that JSON can hold."""
-    # Numbers of numpy become numbers of Python.
-    text = json.dumps(value, default=lambda number: number.item()).encode()
-    put(group, name, np.bytes_(text))
+    """Write a value as JSON text into a dataset; numpy scalars become Python numbers."""
+    put(group, name, np.bytes_(json.dumps(value, default=lambda number: number.item()).encode()))
 
 
 def read_json(group: h5py.Group, name: str) -> Any:
@@ -117,7 +132,7 @@ def read_json(group: h5py.Group, name: str) -> Any:
 
 
 def checksum_of(dataset: h5py.Dataset, first: int = 0, count: int | None = None) -> int:
-    """Checksum of `count` rows, read in pieces."""
+    """Checksum of `count` rows (default: all rows from `first` on), read in pieces."""
     if not dataset.shape:
         return checksum.total([checksum.share(np.asarray(dataset[()]), 0)])
     last = len(dataset) if count is None else first + count
@@ -130,7 +145,7 @@ def checksum_of(dataset: h5py.Dataset, first: int = 0, count: int | None = None)
 
 
 def read_checked(dataset: h5py.Dataset) -> NDArray[Any]:
-    """All of a dataset of a model. InputError if it has a checksum and the checksum is wrong."""
+    """A dataset of a model. InputError if the dataset has a checksum and the checksum is wrong."""
     values = dataset[...]
     if dataset.attrs.get("checksum", total := checksum.total([checksum.share(values, 0)])) != total:
         raise InputError(f"{dataset.file.filename}: is damaged: {dataset.name} is not what was written; {REBUILD}")
@@ -138,7 +153,7 @@ def read_checked(dataset: h5py.Dataset) -> NDArray[Any]:
 
 
 def first_damaged(file: h5py.File) -> str | None:
-    """The name of the first dataset with a wrong checksum."""
+    """The name of the first dataset with a wrong checksum, or None."""
 
     def check(name: str, item: h5py.Group | h5py.Dataset) -> str | None:
         has_checksum = isinstance(item, h5py.Dataset) and "checksum" in item.attrs
@@ -148,10 +163,10 @@ def first_damaged(file: h5py.File) -> str | None:
 
 
 def read_rows(dataset: h5py.Dataset, rows: NDArray[np.int64]) -> NDArray[Any]:
-    """Rows of a dataset, given as ascending numbers without repeats.
+    """Rows of a dataset; `rows` (n,) ascend without repetition.
 
-    Reads ranges and selects from them. Short gaps are read too, so that the time is at most that of reading the file
-    once; HDF5's own point selections cost a search for every row.
+    The function reads ranges and selects rows from them. It also reads short gaps, so that the time is at most the time
+    to read the whole dataset. Point selections of HDF5 need a search for every row.
     """
     values = np.empty((len(rows), *dataset.shape[1:]), dataset.dtype)
     if values.size == 0:
@@ -174,21 +189,21 @@ def read_rows(dataset: h5py.Dataset, rows: NDArray[np.int64]) -> NDArray[Any]:
 def matching(
     dataset: h5py.Dataset, wanted: NDArray[np.int64], divisor: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Values of a list with a quotient in `wanted` (ascending), and their rows; read in pieces."""
+    """Values of a 1D dataset for which value // divisor is in `wanted` (ascending), and their rows; read in pieces."""
     values, rows = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     block = _BUFFER_BYTES // 8
     for start in range(0, len(dataset) if len(wanted) else 0, block):
-        some = dataset[start : start + block]
-        nearest = np.searchsorted(wanted, some // divisor).clip(max=len(wanted) - 1)
-        found = np.flatnonzero(wanted[nearest] == some // divisor)
-        values.append(some[found])
-        rows.append(start + found)
+        piece = dataset[start : start + block]
+        nearest = np.searchsorted(wanted, piece // divisor).clip(max=len(wanted) - 1)
+        matches = np.flatnonzero(wanted[nearest] == piece // divisor)
+        values.append(piece[matches])
+        rows.append(start + matches)
     return np.concatenate(values), np.concatenate(rows)
 
 
 def collective(comm: Any) -> h5py.h5p.PropDXID | None:
     """The property list of a collective transfer; None on one rank."""
-    if comm is None:
+    if comm.size == 1:
         return None
     transfer = h5py.h5p.create(h5py.h5p.DATASET_XFER)
     transfer.set_dxpl_mpio(h5py.h5fd.MPIO_COLLECTIVE)
@@ -196,14 +211,14 @@ def collective(comm: Any) -> h5py.h5p.PropDXID | None:
 
 
 def create(path: Path, comm: Any, mode: str = "w", **options: Any) -> h5py.File:
-    """A file that all ranks write."""
-    if comm is None:
+    """Open a file that all ranks write. Collective."""
+    if comm.size == 1:
         return h5py.File(path, mode, locking=False, **options)
     return h5py.File(path, mode, driver="mpio", comm=comm, **options)
 
 
 def make(group: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any, **options: Any) -> h5py.Dataset:
-    """A dataset, contiguous by default, with its space allocated at once: a killed run keeps what it wrote."""
+    """Create a dataset, contiguous by default. Its space is allocated at once, so that the data survive a kill."""
     properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     properties.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
     properties.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
@@ -217,9 +232,9 @@ def write_rows(
     first_row: int,
     transfer: h5py.h5p.PropDXID | None,
 ) -> int:
-    """Write rows of this rank from row first_row + start on, in one collective call; a rank may have no rows.
+    """Write this rank's rows from row first_row + start on, in one collective call; a rank may have no rows.
 
-    Returns this rank's share of the checksum of the rows from first_row on.
+    Returns this rank's share of the checksum of all rows from first_row on.
     """
     shape = dataset.shape[1:]
     if values.shape[1:] != shape:

@@ -33,7 +33,7 @@ from mpitled.store.files import (
 
 #: Version of the layout. A model of another layout is rebuilt, never read.
 MODEL_LAYOUT = 3
-#: Arrays at the top of the file: type, and lengths by name or number. Kernels index without further checks.
+#: Arrays at the top of the file: type and shape (names of lengths, or numbers). Kernels index them without checks.
 MODEL_ARRAYS: dict[str, tuple[type[np.generic], tuple[str | int, ...]]] = {
     "points": (np.float64, ("nodes", 3)),
     "node_ids": (np.int64, ("nodes",)),
@@ -44,12 +44,12 @@ MODEL_ARRAYS: dict[str, tuple[type[np.generic], tuple[str | int, ...]]] = {
     "prescribed_displacements": (np.float64, ("dofs",)),
     "rotation_paths": (np.float64, ("dofs", 3)),
 }
-#: Upper bound of numbers in SI units.
+#: Upper bound of numbers in SI units; products of a few numbers stay finite.
 _MAX_VALUE = 1e50
 
 
 def block_arrays(kind: CellKind) -> dict[str, tuple[type[np.generic], tuple[str | int, ...]]]:
-    """Arrays in the group of a block of that kind: types and lengths; "n" is the number of nodes per cell."""
+    """Arrays in the group of a block: types and shapes, as in `MODEL_ARRAYS`; "n" is the number of nodes per cell."""
     columns = {name: (np.float64, ("cells", *row)) for name, row in kind.columns.items()}
     return {"nodes": (np.int64, ("cells", kind.n_nodes or "n")), "material": (np.int16, ("cells",)), **columns}
 
@@ -75,11 +75,10 @@ def model_arrays(model: Model) -> dict[str, NDArray[Any]]:
 
 
 def write_model(path: Path, model: Model, key: str, scene: Mapping[str, Any] | None = None) -> None:
-    """Write the model to `path`, completely or not at all; `key` identifies the input of its build (see `model_key`).
+    """Write the model atomically.
 
-    `scene` is the deck, for the export. InputError if the file cannot be written.
-
-    Arrays are contiguous: any range of rows is one read.
+    key: identifies the input of the build, see `model_key`; scene: the deck, for the export. Arrays are contiguous, so
+    that any range of rows is one read. InputError if the file cannot be written.
     """
     arrays = model_arrays(model)
     with replacing(path) as temporary, h5py.File(temporary, "w", locking=False) as file:
@@ -103,7 +102,7 @@ def write_model(path: Path, model: Model, key: str, scene: Mapping[str, Any] | N
 
 
 def read_model(path: Path) -> Model:
-    """The whole model. InputError if the file is missing, damaged, not a model, or of another layout."""
+    """The model. InputError if the file is missing, damaged, no model, or a model of another layout."""
     with open_model(path) as file:
         arrays = {name: read_checked(file[name]) for name in MODEL_ARRAYS}
         n_nodes, materials, blocks = len(file["points"]), read_materials(file), _read_blocks(file)
@@ -134,7 +133,7 @@ def read_model(path: Path) -> Model:
 
 
 def read_blocks(path: Path) -> tuple[CellBlock, ...]:
-    """The blocks of cells: input of a partition."""
+    """The blocks of cells."""
     with open_model(path) as file:
         return _read_blocks(file)
 
@@ -146,7 +145,7 @@ def read_points(path: Path) -> NDArray[np.float64]:
 
 
 def model_key(path: Path) -> str | None:
-    """The key that the model was written with; None if there is no model of this layout."""
+    """The key that was passed to `write_model`; None if the file is no model of this layout."""
     try:
         with open_model(path) as file:
             return str(file.attrs["key"])
@@ -155,38 +154,32 @@ def model_key(path: Path) -> str | None:
 
 
 def check_model(path: Path) -> None:
-    """Read all of the model. InputError names the dataset with a wrong checksum."""
+    """Check every checksum. InputError names the dataset with a wrong checksum."""
     with open_model(path) as file:
         if name := first_damaged(file):
             raise InputError(f"{path}: is damaged: {name} is not what was written")
 
 
-def read_sets(path: Path) -> tuple[dict[str, NDArray[np.int64]], dict[str, NDArray[np.int64]]]:
-    """Node sets and cell sets of the model, by name; ascending global numbers."""
-    with open_model(path) as file:
-        return _read_sets(file["node_sets"]), _read_sets(file["cell_sets"])
-
-
 def read_figures(path: Path) -> ModelFigures:
-    """Numbers that were counted and measured when the model was built."""
+    """Quality figures of the model from its build."""
     with open_model(path) as file:
         return _read_figures(file)
 
 
 def read_scene(path: Path) -> dict[str, Any]:
-    """The deck that the model was built from, in the deck's layout and units."""
+    """The deck of the model, as in the deck file."""
     with open_model(path) as file:
         return dict(read_json(file, "scene")) if "scene" in file else {}
 
 
 def read_remarks(path: Path) -> list[str]:
-    """What the readers and meshers skipped, repaired or assumed, a line each."""
+    """Remarks of readers and meshers, one line each: skipped, repaired or assumed input."""
     with open_model(path) as file:
         return list(_read_remarks(file))
 
 
 def model_contents(path: Path) -> dict[str, Any]:
-    """Sizes, sets, materials and figures of a model, as JSON can hold them."""
+    """Sizes, sets, materials and figures of a model, as a JSON value."""
     with open_model(path) as file:
         blocks = [
             {"name": b.name, "kind": b.kind.name, "cells": b.n_cells, "nodes": b.group["nodes"].shape[1]}
@@ -206,7 +199,7 @@ def model_contents(path: Path) -> dict[str, Any]:
 
 
 def describe_model(path: Path) -> str:
-    """The contents of a model, a line each."""
+    """The contents of a model as text, one item a line."""
     contents = model_contents(path)
     lines = [f"nodes            {contents['nodes']} ({contents['fe_nodes']} FE)"]
     lines += [f"{block['name']:16} {block['cells']} of {block['nodes']} nodes" for block in contents["blocks"]]
@@ -220,7 +213,7 @@ def describe_model(path: Path) -> str:
 
 @contextmanager
 def open_model(path: Path) -> Iterator[h5py.File]:
-    """A model, open for reading, with arrays of valid shapes. InputError if the file is not a model of this layout."""
+    """An open model whose arrays have valid shapes. InputError if the file is no model of this layout."""
     with open_file(path) as file, damaged(path, REBUILD):
         if attribute(file, "format") != "mpitled model":
             raise InputError(f"{path}: is not a model of mpitled; build the model from its deck")
@@ -232,22 +225,22 @@ def open_model(path: Path) -> Iterator[h5py.File]:
 
 
 def block_groups(file: h5py.File) -> list[BlockGroup]:
-    """The blocks of an open model, in order. ValueError if there is a block of no known kind, or of a repeated name."""
-    n_blocks, found, first = attribute(file, "n_blocks"), list[BlockGroup](), 0
+    """The blocks of an open model, in order. ValueError if the kind of a block is unknown or a name is repeated."""
+    n_blocks, blocks, first = attribute(file, "n_blocks"), list[BlockGroup](), 0
     if not isinstance(n_blocks, int) or n_blocks < 0 or n_blocks != len(file.get("blocks", ())):
         raise ValueError(f"n_blocks is not {len(file.get('blocks', ()))}")
     for i in range(n_blocks):
         group = file[f"blocks/{i}"]
         name, kind = (str(attribute(group, key)) for key in ("name", "kind"))
-        if kind not in KINDS or name in {block.name for block in found}:
+        if kind not in KINDS or name in {block.name for block in blocks}:
             raise ValueError(f"block {i} has the kind {kind} and the name {name}")
-        found.append(BlockGroup(name, KINDS[kind], group, first, len(group["nodes"])))
-        first += found[-1].n_cells
-    return found
+        blocks.append(BlockGroup(name, KINDS[kind], group, first, len(group["nodes"])))
+        first += blocks[-1].n_cells
+    return blocks
 
 
 def _check_shapes(file: h5py.File) -> None:
-    """ValueError unless the arrays of a model have the types of the layout and agree in their lengths."""
+    """ValueError unless the arrays of a model have the types of the layout and consistent lengths."""
     n_nodes, n_fe_nodes = len(file["points"]), attribute(file, "n_fe_nodes")
     if not isinstance(n_fe_nodes, int) or not 0 <= n_fe_nodes <= n_nodes:
         raise ValueError(f"n_fe_nodes is not between 0 and {n_nodes}")
@@ -258,7 +251,7 @@ def _check_shapes(file: h5py.File) -> None:
             lengths["n_field"] = block.group["nodes"].shape[-1]
         _check_arrays(block.group, block_arrays(block.kind), {})
     if n_nodes > n_fe_nodes and "n_field" not in lengths:
-        raise ValueError("field_block is no block")
+        raise ValueError("there is no block with the name in field_block")
     _check_arrays(file, MODEL_ARRAYS, lengths)
     if "surface_areas" in file:
         _check_arrays(file, {"surface_areas": (np.float64, ("nodes", 3))}, lengths)
@@ -267,7 +260,7 @@ def _check_shapes(file: h5py.File) -> None:
 def _check_arrays(
     group: h5py.Group, arrays: Mapping[str, tuple[type[np.generic], tuple[str | int, ...]]], lengths: dict[str, int]
 ) -> None:
-    """ValueError unless arrays have these types and lengths; lengths that are not known yet are added."""
+    """ValueError unless the arrays have these types and shapes; adds unknown lengths to `lengths`."""
     for name, (dtype, expected) in arrays.items():
         array = group[name]
         fits = len(array.shape) == len(expected) and array.dtype == dtype
@@ -281,18 +274,18 @@ def _check_arrays(
 def check_range(numbers: NDArray[np.integer], end: int, name: str) -> None:
     """ValueError unless all numbers are in 0 ... end - 1."""
     if numbers.size and not 0 <= numbers.min() <= numbers.max() < end:
-        raise ValueError(f"{name} has numbers beyond 0 to {end - 1}")
+        raise ValueError(f"{name} has numbers outside of 0 to {end - 1}")
 
 
 def check_finite(arrays: Mapping[str, NDArray[Any]]) -> None:
-    """ValueError unless all real numbers are finite and small enough for products of them."""
+    """ValueError unless the absolute values of all real numbers are below `_MAX_VALUE`."""
     for name, values in arrays.items():
         if values.dtype.kind == "f" and not (np.abs(values) < _MAX_VALUE).all():
-            raise ValueError(f"{name} has numbers that are not finite, or beyond {_MAX_VALUE:g}")
+            raise ValueError(f"{name} has numbers that are not finite or exceed {_MAX_VALUE:g}")
 
 
 def check_ascending(numbers: NDArray[np.integer], name: str) -> None:
-    """ValueError unless each number is larger than the one before."""
+    """ValueError unless the numbers ascend without repetition."""
     if (np.diff(numbers) <= 0).any():
         raise ValueError(f"{name} do not ascend")
 
@@ -308,7 +301,7 @@ def _read_blocks(file: h5py.File) -> tuple[CellBlock, ...]:
 
 
 def _write_sets(group: h5py.Group, sets: dict[str, NDArray[np.int64]]) -> None:
-    # Names are data: HDF5 does not allow every name that an input file allows.
+    # Names are stored as data, because input files allow names that HDF5 does not allow.
     write_json(group, "names", list(sets))
     members = [np.asarray(members, np.int64) for members in sets.values()]
     put(group, "offsets", np.cumsum([0, *map(len, members)], dtype=np.int64))
@@ -332,12 +325,12 @@ def read_materials(file: h5py.File) -> tuple[Material, ...]:
 
 
 def _read_figures(file: h5py.File) -> ModelFigures:
-    found = dict(read_json(file, "figures"))
-    numbers = {**found, **found.get("of_mesh", {})}
+    stored = dict(read_json(file, "figures"))
+    numbers = {**stored, **stored.get("of_mesh", {})}
     numbers.pop("of_mesh", None)
     if not all(isinstance(value, int | float | None) for value in numbers.values()):
-        raise ValueError("figures holds what is not a number")
-    return ModelFigures(**{item.name: found[item.name] for item in fields(ModelFigures) if item.name in found})
+        raise ValueError("figures has values that are no numbers")
+    return ModelFigures(**{item.name: stored[item.name] for item in fields(ModelFigures) if item.name in stored})
 
 
 def _read_remarks(file: h5py.File) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""The file layout of partitions in a model, and the rows of the model that one part reads."""
+"""The file layout of partitions in a model, and the rows of the model that one part needs."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ if TYPE_CHECKING:
 
 
 def write_partition(path: Path, tables: PartTables) -> None:
-    """Add the partition to the model, or replace the one with as many parts.
+    """Add the partition to the model; replaces a partition with the same number of parts.
 
-    The model is copied and the copy replaces it: HDF5 has no journal, and an interrupted append could destroy the
-    model. Beside the tables the file stores the row of every node in the result files: owned nodes of part 0 ascending,
-    then those of part 1, and so on.
+    The function writes a copy of the model, which then replaces the model: an interrupted append could destroy an HDF5
+    file. The file also stores the row of every node in results: ascending owned nodes of part 0, then of part 1, and so
+    on. InputError if a node is on no part, or the file cannot be written.
     """
     with open_model(path) as file:
         n_nodes = len(file["points"])
-    # The lowest part, which owns the node, comes first.
-    touched, first = np.unique(tables.nodes, return_index=True)
-    if len(touched) != n_nodes:
-        raise InputError(f"{path}: {n_nodes - len(touched)} nodes are on no part; partition the model anew")
+    # The first entry of a node in the tables is in its lowest part, the owner.
+    nodes, first = np.unique(tables.nodes, return_index=True)
+    if len(nodes) != n_nodes:
+        raise InputError(f"{path}: {n_nodes - len(nodes)} nodes are on no part; partition the model anew")
     owner = np.searchsorted(tables.node_offsets, first, side="right") - 1
     rows = np.empty(n_nodes, np.int64)
     rows[np.argsort(owner, kind="stable")] = np.arange(n_nodes)
@@ -66,56 +66,64 @@ def write_partition(path: Path, tables: PartTables) -> None:
 
 
 def has_partition(path: Path, n_parts: int) -> bool:
-    """Whether the model can be read in so many parts; one part needs no partition."""
+    """Whether `read_part` can read the model in n_parts parts; one part needs no partition."""
     with open_model(path) as file:
         return n_parts == 1 or f"partitions/{n_parts}" in file
 
 
 def partition_mark(path: Path, n_parts: int) -> str:
-    """An identifier of the partition in so many parts. InputError if there is no such partition."""
+    """An identifier of the partition into n_parts parts. InputError if there is no such partition."""
     with open_model(path) as file:
         if n_parts == 1:
             return "whole"
-        if f"partitions/{n_parts}" not in file:
-            raise InputError(f"{path}: has no partition in {n_parts} parts; partition the model first")
-        return f"{n_parts}:{int(file[f'partitions/{n_parts}/nodes'].attrs['checksum']) % (1 << 64):016x}"
+        return f"{n_parts}:{int(_partition(file, n_parts)['nodes'].attrs['checksum']) % (1 << 64):016x}"
 
 
-#: Rows first to last of a column, in the part's order.
+def _partition(file: h5py.File, n_parts: int) -> h5py.Group:
+    if f"partitions/{n_parts}" not in file:
+        raise InputError(f"{file.filename}: has no partition into {n_parts} parts; partition the model first")
+    return file[f"partitions/{n_parts}"]
+
+
+#: Function of (column, first, last): rows first to last of a column, in the order of the part.
 Source = Callable[[str, int, int], NDArray[Any]]
 #: Columns with a row for each node of the part.
 NODE_COLUMNS = ("node_ids", "rows", "points", "mass")
-#: Rows of a column that are read at a time.
+#: Rows of a column that one call reads or writes.
 CHUNK_ROWS = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
 class PartBlock:
-    """The cells of one block that are on a part; there may be none.
+    """The cells of one block on a part; n_own may be 0.
 
-    Columns with a row for each of these cells: "cells", int64, ascending numbers in the model; "nodes" (.., k), int64,
-    global; "material", int16; and those of the kind, see `CellKind.columns`.
+    Columns: "cells" (n_own,), int64, ascending numbers in the model; "nodes" (n_own, k), int64, global numbers;
+    "material" (n_own,), int16; and the columns of the kind, see `CellKind.columns`.
     """
 
     name: str
     kind: CellKind
     n_nodes: int  # nodes per cell, k
-    n_cells: int  # of the block in the whole model
-    n_own: int  # of the block on this part
-    first_own: int  # local number of the first of these: local cells are numbered block after block
+    n_cells: int  # cells of the block in the whole model
+    n_own: int  # cells of the block on this part
+    first_own: int  # local number of the first cell; local cells are numbered block after block
     source: Source
 
     def read(self, name: str, first: int = 0, last: int | None = None) -> NDArray[Any]:
-        """Rows first to last of a column, from the file. InputError if it cannot be read any more."""
+        """Rows first to last of a column, from the file. InputError if reading fails."""
         return self.source(name, first, self.n_own if last is None else last)
 
     def chunks(self, name: str) -> Iterator[tuple[int, NDArray[Any]]]:
-        """A column in pieces of `CHUNK_ROWS`, each with its first row."""
+        """Pairs (first row, rows) of a column in pieces of `CHUNK_ROWS`."""
         for first in range(0, self.n_own, CHUNK_ROWS):
             yield first, self.read(name, first, min(first + CHUNK_ROWS, self.n_own))
 
     def gradients(self, points: NDArray[np.float64], cells: NDArray[np.integer], first: int, rule: str = "mean") -> Any:
-        """Gradients (n, k, 3), 1/m, of cells (n, k) in local nodes, rows `first` and following of the block."""
+        """Gradients (n, k, 3), 1/m, of the shape functions of `cells` (n, k).
+
+        points: (n_nodes, 3), m; cells: local nodes of the rows first to first + n of the block; rule: "mean" or
+        "centre", for hexahedra.
+        """
         if self.kind.geometry:
             return self.kind.geometry(points, cells, rule)[0]
         return self.read("gradients", first, first + len(cells))
@@ -125,11 +133,11 @@ class PartBlock:
 class PartRows:
     """The rows of the model that one part needs, in SI units and global numbers.
 
-    A cell is on one part. A node is on every part with a cell that touches it; the lowest of these parts owns the node.
-    Long columns stay in the file until they are read, so that a run does not hold what it needs once. `read` gives
-    columns of `nodes`: "node_ids" (k,), numbers in the input file; "rows" (k,) in the result files; "points" (k, 3), m;
-    "mass" (k,), kg, of the whole model's cells. Columns of cells are in `blocks`; `read` gives "cells" and "material"
-    of all blocks.
+    A cell is on one part. A node is on every part with a cell that touches the node; the lowest of these parts owns the
+    node. Long columns stay in the file: a run reads them once and does not store them. `read` returns columns of
+    `nodes`: "node_ids" (k,), numbers in the input file; "rows" (k,), rows in results; "points" (k, 3), m; "mass" (k,),
+    kg, with the cells of all parts. `read` also returns "cells" and "material" of all blocks; `blocks` have all columns
+    of cells.
     """
 
     n_parts: int
@@ -137,19 +145,19 @@ class PartRows:
     n_nodes: int  # of the whole model
     n_fe_nodes: int  # of the whole model
     blocks: tuple[PartBlock, ...]  # all blocks of the model, in order
-    nodes: NDArray[np.signedinteger]  # (k,) ascending nodes that the part's cells touch; int32 if the numbers allow it
+    nodes: NDArray[np.signedinteger]  # (k,) ascending nodes of the part's cells; int32 if n_nodes permits
     owned: NDArray[np.bool_]  # (k,)
-    first_row: int  # row of the first owned node; the rows of owned nodes are consecutive
+    first_row: int  # row of the first owned node in results; the rows of owned nodes are consecutive
     materials: tuple[Material, ...]
     prescribed_dofs: NDArray[np.int64]  # ascending 3 node + direction, on `nodes`
     prescribed_displacements: NDArray[np.float64]  # m
     rotation_paths: NDArray[np.float64]  # (len(prescribed_dofs), 3)
     field_block: str  # name of the block that interpolates the field at EFG nodes
-    field_nodes: NDArray[np.int64]  # ascending EFG nodes with a field from a cell of this part; not all in `nodes`
-    field_domains: NDArray[np.int64]  # that cell for each, a row of the block on this part
+    field_nodes: NDArray[np.int64]  # ascending EFG nodes whose field a cell of this part gives; may not be in `nodes`
+    field_domains: NDArray[np.int64]  # (len(field_nodes),) these cells, rows of the field block on this part
     field_shapes: NDArray[np.float64]  # (len(field_nodes), k)
-    neighbours: NDArray[np.int32]  # ascending parts that share nodes with this one
-    shared: NDArray[np.int64]  # ascending nodes shared with each neighbour in turn
+    neighbours: NDArray[np.int32]  # ascending parts that share nodes with this part
+    shared: NDArray[np.int64]  # nodes shared with the first neighbour, ascending, then with the second, and so on
     shared_offsets: NDArray[np.int64]  # (len(neighbours) + 1,) into `shared`
     source: Source
 
@@ -172,17 +180,17 @@ class PartRows:
         return sum(block.n_own for block in self.of_kind(kind))
 
     def find_cell(self, cell: int) -> tuple[PartBlock, int]:
-        """The block of a local cell, and its row there."""
+        """The block of a local cell, and the row of the cell in the block."""
         block = next(block for block in self.blocks if cell < block.first_own + block.n_own)
         return block, cell - block.first_own
 
     def local(self, nodes: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Local numbers of nodes of this part."""
-        # Of the same type: numpy would convert all of `nodes` otherwise.
+        """Local numbers of nodes of this part, from global numbers."""
+        # With another type, numpy would convert all of `self.nodes`.
         return np.searchsorted(self.nodes, nodes.astype(self.nodes.dtype, copy=False))
 
     def read(self, name: str, first: int = 0, last: int | None = None) -> NDArray[Any]:
-        """Rows first to last of a column, from the file. InputError if it cannot be read any more."""
+        """Rows first to last of a column, from the file. InputError if reading fails."""
         if name in NODE_COLUMNS:
             return self.source(name, first, len(self.nodes) if last is None else last)
         last = self.n_own_cells if last is None else last
@@ -190,7 +198,7 @@ class PartRows:
         return np.concatenate([block.read(name, start, stop) for block, start, stop in ranges])
 
     def with_columns(self, **columns: NDArray[Any]) -> PartRows:
-        """The same with other columns of nodes, or of all cells, instead of those of the file."""
+        """A copy with these columns, of nodes or of all cells, in place of the columns of the file."""
         blocks = [
             replace(b, source=_replaced(b.source, {n: v[b.first_own :][: b.n_own] for n, v in columns.items()}))
             for b in self.blocks
@@ -206,10 +214,10 @@ def _replaced(source: Source, columns: dict[str, NDArray[Any]]) -> Source:
 
 
 class _PartFile:
-    """Columns of one part in an open model; the file stays open, even if another file takes its name."""
+    """Columns of one part in an open model. The file stays open, even if another file replaces it."""
 
     def __init__(self, path: Path, n_parts: int, part: int, nodes: NDArray[np.signedinteger]) -> None:
-        """nodes: of the part, ascending."""
+        """nodes: (k,) ascending nodes of the part."""
         self._file, self._path, self._nodes = open_file(path), path, nodes
         self._group = None if n_parts == 1 else self._file[f"partitions/{n_parts}"]
         self._cells = slice(0, 0) if self._group is None else _range(self._group["cell_offsets"], part)
@@ -221,8 +229,8 @@ class _PartFile:
             return read_rows((self._group if name == "rows" else self._file)[name], self._nodes[first:last])
 
     def blocks(self) -> tuple[PartBlock, ...]:
-        """The blocks, with the rows that are on the part."""
-        found, first_own = [], 0
+        """All blocks of the model."""
+        blocks, first_own = [], 0
         own = None if self._group is None else self._group["cells"][self._cells]
         for block in block_groups(self._file):
             n_own = block.n_cells
@@ -230,9 +238,9 @@ class _PartFile:
                 n_own = int(np.diff(np.searchsorted(own, [block.first, block.first + n_own]))[0])
             source = self._block_source(block, first_own)
             k = block.group["nodes"].shape[1]
-            found.append(PartBlock(block.name, block.kind, k, block.n_cells, n_own, first_own, source))
+            blocks.append(PartBlock(block.name, block.kind, k, block.n_cells, n_own, first_own, source))
             first_own += n_own
-        return tuple(found)
+        return tuple(blocks)
 
     def _block_source(self, block: BlockGroup, first_own: int) -> Source:
         start = self._cells.start + first_own
@@ -250,9 +258,9 @@ class _PartFile:
 
 
 def read_part(path: Path, n_parts: int, part: int) -> PartRows:
-    """The rows of part `part` of `n_parts`. The file stays open for `PartRows.read`.
+    """The rows of one part. The file stays open for `PartRows.read`.
 
-    InputError if the model has no such partition.
+    InputError if the model has no partition into n_parts parts, or is damaged.
     """
     with open_model(path) as file:
         n_nodes, n_fe_nodes = len(file["points"]), int(file.attrs["n_fe_nodes"])
@@ -262,9 +270,7 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
             first_row, end_row = 0, n_nodes
             neighbours, shared, shared_offsets = np.empty(0, np.int32), np.empty(0, np.int64), np.zeros(1, np.int64)
         else:
-            if f"partitions/{n_parts}" not in file:
-                raise InputError(f"{path}: has no partition in {n_parts} parts; partition the model first")
-            group = file[f"partitions/{n_parts}"]
+            group = _partition(file, n_parts)
             nodes = group["nodes"][_range(group["node_offsets"], part)]
             check_range(nodes, len(group["rows"]), "nodes")
             rows = read_rows(group["rows"], nodes)
@@ -284,7 +290,7 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
                 check_range(numbers, end, name)
                 check_ascending(numbers, name)
             if part in neighbours or not np.isin(shared, nodes).all():
-                raise ValueError("a part shares with itself, or nodes that are not its own")
+                raise ValueError("a part shares nodes with itself, or shares nodes of other parts")
             nodes = _narrowed(nodes, n_nodes)
         source = _PartFile(path, n_parts, part, nodes)
         blocks, field_block = source.blocks(), str(attribute(file, "field_block"))
@@ -323,12 +329,12 @@ def read_part(path: Path, n_parts: int, part: int) -> PartRows:
 
 
 def _narrowed(nodes: NDArray[np.int64], n_nodes: int) -> NDArray[np.signedinteger]:
-    """Node numbers in half the memory where a model has no more than 2^31 nodes."""
+    """Node numbers as int32, which halves their memory, if the model has fewer than 2^31 nodes."""
     return nodes.astype(np.int32) if n_nodes <= np.iinfo(np.int32).max else nodes
 
 
 def _check_columns(part: PartRows) -> None:
-    """ValueError unless the long columns hold valid numbers."""
+    """ValueError unless the columns in the file hold valid numbers."""
     for name in NODE_COLUMNS:
         for first in range(0, len(part.nodes), CHUNK_ROWS):
             check_finite({name: part.read(name, first, min(first + CHUNK_ROWS, len(part.nodes)))})
@@ -336,10 +342,10 @@ def _check_columns(part: PartRows) -> None:
         for name in ("cells", *block_arrays(block.kind)):
             for _, values in block.chunks(name):
                 if name == "nodes":
-                    # A node that is not on this part would be an index beyond its arrays.
                     check_range(values, part.n_nodes, f"nodes of {block.name}")
+                    # The local number of a node outside of the part would be beyond the arrays of the part.
                     if not (part.nodes.take(part.local(values), mode="clip") == values).all():
-                        raise ValueError(f"{block.name} have nodes that their part does not have")
+                        raise ValueError(f"a cell of {block.name} has a node that is not on the part of the cell")
                 elif name == "material":
                     check_range(values, len(part.materials), f"material of {block.name}")
                 else:

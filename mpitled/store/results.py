@@ -1,4 +1,4 @@
-"""The file layout of results (VTKHDF, and checksums beside it), and reading them."""
+"""The file layout of results: VTKHDF with checksums in a group of its own; and how to read results."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from mpitled.errors import InputError, damaged
 from mpitled.hdf5 import open_file
 from mpitled.store.files import AGAIN, attribute, checksum_of, first_damaged, matching, read_json, read_rows
 
-#: Results of another layout are refused.
+#: Version of the layout. Results of another layout are refused.
 RESULT_LAYOUT = 3
 FINISHED, UNFINISHED = "result.vtkhdf", "result.partial.vtkhdf"
-#: Units of the data, also in the attribute "units" of the datasets; decks and reports are in mm.
+#: Units of the data, and values of the attribute "units" of the datasets.
 UNITS = {"Points": "m", "displacement": "m", "parameters": "m", "stress": "Pa", "Values": "s"}
 #: Cell data "kind" of the vertices of EFG nodes; blocks have `CellKind.code`.
 EFG_NODE = 1
@@ -46,9 +46,9 @@ def series_of(time: float, series: Mapping[str, float]) -> NDArray[np.float64]:
 
 
 class Result:
-    """The results of a run, read on demand: the grid in the order of the file, or in the order of the model.
+    """The results of a run. Data are read on demand, in the order of the file or in the order of the model.
 
-    Use it `with damaged` where the file may come from others.
+    Methods raise InputError if a checksum is wrong. Use `errors.damaged` for a file from an untrusted source.
     """
 
     def __init__(self, file: h5py.File, path: Path) -> None:
@@ -56,7 +56,7 @@ class Result:
 
     @cached_property
     def _of_mesh(self) -> dict[str, int]:
-        """Checksums of the datasets that are the same in every frame."""
+        """Checksums of the datasets of the mesh, by name."""
         return dict(read_json(self._file["mpitled"], "mesh_checksums"))
 
     def __enter__(self) -> Result:
@@ -72,32 +72,31 @@ class Result:
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """The metadata that the run was started with."""
+        """The metadata at the start of the run."""
         return read_json(self._file["mpitled"], "metadata")
 
     @property
     def figures(self) -> dict[str, Any]:
-        """The figures that the run ended with; empty if it was killed."""
+        """The figures of the run at its end; empty if the run was killed."""
         return read_json(self._file["mpitled"], "figures") if "figures" in self._file["mpitled"] else {}
 
     def check(self) -> None:
-        """Read all of the file. InputError names the data with a wrong checksum."""
-        found = first_damaged(self._file)
+        """Check every checksum. InputError names the data with a wrong checksum."""
+        if name := first_damaged(self._file):
+            raise self._damaged(name)
         for name, total in self._of_mesh.items():
             if checksum_of(self._grid[name]) != total:
-                found = found or name
+                raise self._damaged(name)
         for name in (*(f"PointData/{n}" for n in self.names("Point")), *(f"CellData/{n}" for n in self.names("Cell"))):
             n_rows = int(self._grid[f"NumberOf{name.partition('Data')[0]}s"][0])
             totals = self._file[f"mpitled/checksums/{name}"]
             for frame in range(self.n_frames):
                 if checksum_of(self._grid[name], frame * n_rows, n_rows) != totals[frame]:
-                    found = found or f"{name} of frame {frame}"
-        if found:
-            raise self._damaged(found)
+                    raise self._damaged(f"{name} of frame {frame}")
         _ = self._numbers
 
     def names(self, kind: str) -> list[str]:
-        """Names of the data that each frame holds for each "Point" or "Cell"."""
+        """Names of the "Point" or "Cell" data of each frame."""
         return list(self._file[f"mpitled/checksums/{kind}Data"])
 
     @property
@@ -112,7 +111,7 @@ class Result:
 
     @property
     def series(self) -> dict[str, NDArray[np.float64]]:
-        """Numbers of each frame, (n_frames,), by name."""
+        """Numbers of the frames, (n_frames,), by name."""
         return self._numbers[1]
 
     @cached_property
@@ -144,7 +143,10 @@ class Result:
         return self._block_ranges[name][0]
 
     def corners(self, name: str) -> NDArray[np.int64]:
-        """(cells, corners) of a block in the order of the file, rows of `points`; of mesh-free blocks, one each."""
+        """Corners of a block's cells, (cells, corners), as rows of `points`, in the order of the file.
+
+        A mesh-free cell has one corner: its integration point.
+        """
         rows, corners = self._block_ranges[name]
         return self._connectivity[corners].reshape(rows.stop - rows.start, -1)
 
@@ -171,11 +173,11 @@ class Result:
         return self._checked("Connectivity", self._grid["Connectivity"][...])
 
     def point_data(self, name: str, frame: int = 0) -> NDArray[Any]:
-        """Values at `points` in a frame (negative: from the last), or the same in all frames."""
+        """Values (n_points, ...) at `points` in a frame (negative: from the end); data of the mesh have no frame."""
         return self._rows("Point", name, frame)
 
     def cell_data(self, name: str, frame: int = 0) -> NDArray[Any]:
-        """Values in cells: blocks with faces, EFG nodes (nan or -1 where they have no value), integration points."""
+        """Values (n_cells, ...) of blocks with faces, of EFG nodes (nan or -1: no value), of integration points."""
         return self._rows("Cell", name, frame)
 
     @property
@@ -198,17 +200,17 @@ class Result:
         return self.cell_data(name, frame)[_ascending(self.cell_data("cell_id"))]
 
     def find(self, numbers: str, wanted: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows (ascending) of the wanted (ascending) "node_id" or "cell_id", and the entry of each wanted one there."""
+        """(order, rows) of the wanted "node_id" or "cell_id" (ascending): wanted[i] is in row rows[order[i]]."""
         kind = "Point" if numbers == "node_id" else "Cell"
-        found, rows = matching(self._grid[f"{kind}Data/{numbers}"], wanted, 1)
-        return np.argsort(found), rows
+        stored, rows = matching(self._grid[f"{kind}Data/{numbers}"], wanted, 1)
+        return np.argsort(stored), rows
 
     def point_rows(self, cell_rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Rows of the points of mesh-free cells, from rows of the cells: both lists end with these, in one order."""
+        """Rows of the integration points of mesh-free cells: points and cells end with these, in the same order."""
         return cell_rows - int(self._grid["NumberOfCells"][0]) + int(self._grid["NumberOfPoints"][0])
 
     def rows(self, kind: str, name: str, frame: int, rows: NDArray[np.int64]) -> NDArray[Any]:
-        """Some rows (ascending) of the data of a frame for each "Point" or "Cell"."""
+        """Rows (ascending) of the "Point" or "Cell" data of a frame."""
         first = int(self._grid[f"Steps/{kind}DataOffsets/{name}"][frame])
         return read_rows(self._grid[f"{kind}Data/{name}"], first + rows)
 
@@ -218,7 +220,7 @@ class Result:
         return self._checked(f"{kind}Data/{name}", values, frame)
 
     def _checked(self, name: str, values: NDArray[Any], frame: int = 0) -> NDArray[Any]:
-        """The values. InputError if their checksum is wrong."""
+        """Returns the values. InputError if their checksum is wrong."""
         of_frames = self._file["mpitled/checksums"].get(name)
         if of_frames is None:
             expected, label = self._of_mesh[name], name
@@ -234,24 +236,24 @@ class Result:
 
 
 def _ascending(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Rows of the numbers 0, 1, ..., in this order; -1 is not a number."""
+    """Rows of the numbers 0, 1, 2, ..., in this order; -1 is ignored."""
     rows = np.flatnonzero(numbers >= 0)
     return rows[np.argsort(numbers[rows])]
 
 
 def unfinished_bytes(directory: Path) -> int:
-    """Size of the unfinished results in a directory; a run there continues or replaces them."""
+    """Size in bytes of the unfinished result in a directory, or 0."""
     path = Path(directory) / UNFINISHED
     return path.stat().st_size if path.exists() else 0
 
 
 def is_unfinished(directory: Path) -> bool:
-    """Whether a directory holds results of a run that did not finish."""
+    """Whether a directory holds an unfinished result."""
     return (Path(directory) / UNFINISHED).exists()
 
 
 def is_finished(directory: Path) -> bool:
-    """Whether a directory holds the result of a run that finished."""
+    """Whether a directory holds a finished result."""
     return (Path(directory) / FINISHED).exists()
 
 
@@ -263,16 +265,16 @@ def is_result(path: Path) -> bool:
 
 
 def open_result(path: Path) -> Result:
-    """Results in a file, or in a directory: the unfinished ones, if any, because they are newer than finished ones.
+    """Open the result in a file, or in a directory. An unfinished result is newer than a finished one and preferred.
 
-    InputError if there are no results, or the file is not a result of mpitled or truncated.
+    InputError if there is no result, or the file is damaged or has another layout.
     """
     path = Path(path)
     if path.is_dir():
-        found = [path / name for name in (UNFINISHED, FINISHED) if (path / name).exists()]
-        if not found:
+        existing = [path / name for name in (UNFINISHED, FINISHED) if (path / name).exists()]
+        if not existing:
             raise InputError(f"{path}: holds no result; give the folder that 'mpitled run' wrote")
-        path = found[0]
+        path = existing[0]
     file = open_file(path)
     try:
         with damaged(path, AGAIN):

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mpitled import checksum
 from mpitled.errors import InputError
 from mpitled.store.files import (
+    OneRank,
     check_free_space,
     collective,
     create,
@@ -41,27 +42,27 @@ from mpitled.store.results import (
 )
 
 _VTK_VERTEX = 1
-#: Bytes in a result, of the mesh and of each frame: of a point (position, two numbers; two displacements), of a cell
-#: (offset, type, number, material, kind, part; frames hold 8 for each component), and of a corner of a cell.
+#: Bytes of a point in the mesh (position, two numbers) and in each frame (two displacements); of a cell in the mesh
+#: (offset, type, number, material, kind, part); and of a corner of a cell.
 _POINT_BYTES, _CELL_BYTES, _CORNER_BYTES = (24 + 16, 48), 8 + 1 + 8 + 2 + 1 + 4, 8
-#: Bytes of the tables of steps for each frame; of the deck and of HDF5 itself.
+#: Bytes of the tables of steps for each frame; bytes of the deck and of HDF5's metadata.
 _FRAME_BYTES, _FIXED_BYTES = 537, 47_800
 
 
 class _Section(NamedTuple):
     """Consecutive points or cells of the result, with the rows of this rank.
 
-    Points: the nodes (no block), and the integration points of each mesh-free block. Cells: the blocks, and a vertex
-    for each EFG node (no block).
+    Sections of points: the nodes (block None), and the integration points of each mesh-free block. Sections of cells:
+    the blocks, and one vertex for each EFG node (block None).
     """
 
     block: PartBlock | None
     corners: int  # points per cell
-    n_own: int  # on this rank
-    most: int  # on any rank
-    row: int  # first of this rank
+    n_own: int  # rows of this rank
+    max_own: int  # largest n_own of all ranks
+    row: int  # first row of this rank in the file
     corner: int  # first corner of this rank in the connectivity
-    data: int  # first row of this rank in the data of a frame
+    data: int  # first row in this rank's data of a frame
 
 
 #: Datasets with a row for each cell, and their types.
@@ -72,12 +73,15 @@ _CELL_COLUMNS: dict[str, Any] = {
     "CellData/kind": np.uint8,
     "CellData/part": np.int32,
 }
-#: Rows first to last of this rank in a section.
+#: Function of (section, first, last): rows first to last of this rank in the section.
 Rows = Callable[[_Section, int, int], NDArray[Any]]
 
 
 def result_bytes(rows: PartRows, n_frames: int, cell_data: Mapping[str, int]) -> int:
-    """Size of the whole model's result.vtkhdf with so many frames, within some kilobytes; see `ResultWriter`."""
+    """Size in bytes of result.vtkhdf for the whole model and n_frames frames, within a few kilobytes.
+
+    cell_data: components of the cell data of each frame, by name.
+    """
     n_efg, meshfree = rows.n_nodes - rows.n_fe_nodes, sum(b.n_cells for b in rows.blocks if b.kind.meshfree)
     n_corners = n_efg + meshfree + sum(b.n_cells * b.n_nodes for b in rows.blocks if not b.kind.meshfree)
     size = sum(_POINT_BYTES[k] * (rows.n_nodes + meshfree) * n for k, n in enumerate((1, n_frames)))
@@ -86,12 +90,12 @@ def result_bytes(rows: PartRows, n_frames: int, cell_data: Mapping[str, int]) ->
 
 
 class ResultWriter:
-    """Writes `result.vtkhdf`: a VTKHDF unstructured grid with steps, one piece for the whole mesh, in parallel.
+    """Writes `result.vtkhdf` in parallel: a VTKHDF unstructured grid with time steps, in one piece.
 
-    Points are the owned nodes, then the integration points of each mesh-free block. Cells are the blocks with faces, a
-    vertex for each EFG node, and a vertex for each integration point. Each of these sections holds the rows of rank 0,
-    1, ... in turn. The mesh is written once, undeformed. Every method is collective. Until `close` the file is named
-    `result.partial.vtkhdf`, and at any time it can be read with all complete frames.
+    Points are the nodes, then the integration points of each mesh-free block. Cells are the blocks with faces, then a
+    vertex for each EFG node, then a vertex for each integration point. Each section holds the rows of rank 0, rank 1,
+    and so on. The undeformed mesh is written once. Every method is collective. Until `close`, the name of the file is
+    `result.partial.vtkhdf`. Readers can read all complete frames at any time.
 
     VTKHDF: https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format/vtkhdf_specifications.html
     """
@@ -109,56 +113,54 @@ class ResultWriter:
         series: Sequence[str] = (),
         frames: int = 0,
     ) -> None:
-        """Write the mesh and allocate space for at most `n_frames` frames, or continue an unfinished file.
+        """Write the mesh and allocate space for `n_frames` frames, or continue an unfinished file.
 
-        Continuing keeps the first `frames` frames of the unfinished file in the directory: in place where it was
-        written for the same partition (the metadata's "partition"), else in a new file, by global numbers.
-        `comm` is an MPI communicator with the parts as ranks, in order, or None. `metadata` is a value that JSON can
-        hold; that of rank 0 is written. `point_data` and `cell_data` give the components of the data of each frame;
-        `series` names the numbers of each frame. InputError, here and in all methods, if the file cannot be written.
+        comm: mpi4py communicator, rank i has part i; None for one rank.
+        metadata: JSON value; the value of rank 0 is written.
+        point_data, cell_data: number of components of the data of each frame, by name.
+        series: names of the numbers of each frame.
+        frames: frames of the unfinished file in the directory to keep. If the file has the same partition (see
+            metadata "partition"), the writer continues it; otherwise the writer copies the frames into a new file.
+
+        All methods raise InputError if the file cannot be written.
         """
-        if comm is not None and comm.size == 1:
-            comm = None
-        if comm is not None and not has_mpi():
+        comm = comm or OneRank()
+        if comm.size > 1 and not has_mpi():
             raise InputError("h5py: is built without MPI; build it against parallel HDF5, or run on one rank")
         self._comm, self._part, self._n_frames, self._frame = comm, part, n_frames, 0
-        self._announced = {*point_data, *cell_data, *series}
+        self._names = {*point_data, *cell_data, *series}
         self._path = Path(directory) / FINISHED
         self._partial = Path(directory) / UNFINISHED
         self._transfer = collective(comm)
-        self._shares: dict[str, int] = {}  # of this rank, to the checksums of what is written once
+        self._shares: dict[str, int] = {}  # this rank's shares of the checksums of the mesh
         self._count()
         with writing(self._partial):
             if self._leads:
                 Path(directory).mkdir(parents=True, exist_ok=True)
-            if comm is not None:
-                comm.barrier()
+            comm.barrier()
             if not frames:
                 self._begin(self._partial, point_data, cell_data, series, metadata)
                 return
         with open_result(self._partial) as old:
             if old.n_frames < frames:
-                raise InputError(
-                    f"{self._partial}: holds {old.n_frames} frames of {frames}; begin anew, without --resume"
-                )
+                raise InputError(f"{self._partial}: holds {old.n_frames} of {frames} frames; run it without --resume")
             if old.metadata["partition"] != metadata["partition"]:
                 new = self._partial.with_name(f".{self._partial.name}")
                 with writing(new):
                     self._begin(new, point_data, cell_data, series, metadata)
-                self._take_over(old, frames, series)
+                self._copy_frames(old, frames, series)
                 if self._leads:
                     with writing(new):
                         fsync(new)
                         os.replace(new, self._partial)
                 return
-        if comm is not None:
-            comm.barrier()
+        comm.barrier()
         with writing(self._partial):
             self._file = create(self._partial, comm, "r+")
             self._frame = frames
             if "figures" in self._file["mpitled"]:
                 del self._file["mpitled/figures"]
-            self._announce(frames)
+            self._publish(frames)
 
     def _begin(
         self,
@@ -168,14 +170,13 @@ class ResultWriter:
         series: Sequence[str],
         metadata: Mapping[str, Any],
     ) -> None:
-        """A new file with the mesh, no frame, and space for all frames."""
+        """Create a file with the mesh, and space for all frames."""
         components = sum(point_data.values()) * self._n_points + sum(cell_data.values()) * self._n_cells
         if self._leads:
             path.unlink(missing_ok=True)
             fixed = 8 * self._n_corners + 40 * self._n_points + 28 * self._n_cells
             check_free_space(path, 8 * self._n_frames * components + fixed)
-        if self._comm is not None:
-            self._comm.barrier()
+        self._comm.barrier()
         self._file = create(path, self._comm)
         self._write_mesh()
         self._make_steps(point_data, cell_data, series)
@@ -188,14 +189,14 @@ class ResultWriter:
             for block in self._part.blocks
         ]
         write_json(ours, "blocks", blocks)  # the same on all ranks
-        self._note("metadata", metadata)
-        self._note("mesh_checksums", self._totals(self._shares))
+        self._write_json("metadata", metadata)
+        self._write_json("mesh_checksums", self._totals(self._shares))
         self._file.flush()
         if self._leads:
             reserve(path)
 
-    def _take_over(self, old: Result, frames: int, series: Sequence[str]) -> None:
-        """Write the first frames of a file that was written in other parts."""
+    def _copy_frames(self, old: Result, frames: int, series: Sequence[str]) -> None:
+        """Copy the first frames of a file with another partition, by global numbers of nodes and cells."""
         part = self._part
         nodes, in_nodes = old.find("node_id", part.nodes[part.owned])
         cells, in_cells = old.find("cell_id", part.read("cells"))
@@ -217,7 +218,7 @@ class ResultWriter:
 
     @property
     def _leads(self) -> bool:
-        return self._comm is None or self._comm.rank == 0
+        return bool(self._comm.rank == 0)
 
     def write_frame(
         self,
@@ -226,16 +227,16 @@ class ResultWriter:
         cell_data: Mapping[str, NDArray[np.floating]],
         series: Mapping[str, float] | None = None,
     ) -> None:
-        """Write one frame, and publish it to readers.
+        """Write one frame, and show it to readers.
 
-        Point data: (owned nodes + own integration points, components), nodes ascending, then the points of the
-        mesh-free blocks in order. Cell data: (own cells, components) in the order of the part's "cells". Time (s) and
-        series are those of rank 0.
+        time: s, of rank 0; series: numbers by name, of rank 0; point_data: (owned nodes + integration points of this
+        rank, components), nodes ascending, then the points of the mesh-free blocks in order; cell_data: (cells of this
+        rank, components) in the order of the part's "cells". ValueError if names or lengths are wrong.
         """
         if self._frame == self._n_frames:
-            raise ValueError(f"{self._n_frames} frames were announced, and one more is written")
-        if {*point_data, *cell_data, *(series or {})} != self._announced:
-            raise ValueError(f"every frame holds {', '.join(sorted(self._announced))}")
+            raise ValueError(f"the file has space for {self._n_frames} frames only")
+        if {*point_data, *cell_data, *(series or {})} != self._names:
+            raise ValueError(f"every frame holds {', '.join(sorted(self._names))}")
         shares = {"series": checksum.share(series_of(time, series or {}), 0) if self._leads else 0}
         with writing(self._partial):
             for kind, data in (("Point", point_data), ("Cell", cell_data)):
@@ -249,10 +250,10 @@ class ResultWriter:
                     self._file[f"mpitled/checksums/{name}"][self._frame] = total
             self._file.flush()
             self._frame += 1
-            self._announce(self._frame, time)
+            self._publish(self._frame, time)
 
     def _write_data(self, kind: str, name: str, values: NDArray[np.floating]) -> int:
-        """Write "Point" or "Cell" data of the present frame; this rank's share of the checksum."""
+        """Write "Point" or "Cell" data of the current frame; returns this rank's share of the checksum."""
         sections, n = (self._points, self._n_points) if kind == "Point" else (self._cells, self._n_cells)
         length = self._part.n_own_cells if kind == "Cell" else sum(section.n_own for section in sections)
         if len(values) != length:
@@ -265,10 +266,10 @@ class ResultWriter:
 
         return self._write_sections(self._file[f"VTKHDF/{kind}Data/{name}"], sections, rows, self._frame * n)
 
-    def _announce(self, n_frames: int, time: float | None = None) -> None:
-        """Publish so many frames to readers, and the time (s) of the last."""
+    def _publish(self, n_frames: int, time: float | None = None) -> None:
+        """Show the first n_frames frames to readers; time: of the last frame, s."""
         steps = self._file["VTKHDF/Steps"]
-        # Both before the next flush: VTK allocates NSteps times and reads all times into them.
+        # Change both before the next flush: VTK allocates NSteps numbers and reads all values into them.
         steps.attrs.modify("NSteps", np.int64(n_frames))
         steps["Values"].resize((n_frames,))
         if self._leads and time is not None:
@@ -276,10 +277,10 @@ class ResultWriter:
         self._file.flush()
 
     def rewind(self, frames: int) -> None:
-        """Continue after so many frames; later frames are overwritten."""
+        """Continue after the first `frames` frames; the writer overwrites later frames."""
         with writing(self._partial):
             self._frame = frames
-            self._announce(frames)
+            self._publish(frames)
 
     def sync(self) -> None:
         """Flush the frames to disc."""
@@ -287,49 +288,51 @@ class ResultWriter:
             fsync(self._partial)
 
     def close(self, figures: Mapping[str, Any] | None = None) -> None:
-        """Finish the file with rank 0's figures of the run (a value that JSON can hold) and rename it."""
+        """Complete the file with the figures of the run (JSON value, of rank 0), and give the file its final name."""
         self.abandon(figures)
         if self._leads:
             with writing(self._partial):
                 fsync(self._partial)
                 os.replace(self._partial, self._path)
                 fsync(self._path.parent)
-        if self._comm is not None:
-            self._comm.barrier()
+        self._comm.barrier()
 
     def abandon(self, figures: Mapping[str, Any] | None = None) -> None:
-        """Close the file under the name of an unfinished result; it can be read."""
+        """Close the file under the name of an unfinished result."""
         with writing(self._partial):
-            self._note("figures", figures or {})
+            self._write_json("figures", figures or {})
             self._file.close()
 
-    def _note(self, name: str, value: Mapping[str, Any]) -> None:
-        # The same on all ranks: HDF5 requires this where a dataset is made.
-        write_json(self._file["mpitled"], name, value if self._comm is None else self._comm.bcast(dict(value)))
+    def _write_json(self, name: str, value: Mapping[str, Any]) -> None:
+        # All ranks must create the same dataset.
+        write_json(self._file["mpitled"], name, self._comm.bcast(dict(value)))
 
     def _totals(self, shares: Mapping[str, int]) -> dict[str, int]:
-        """The checksums, sums of the shares of all ranks."""
-        rows = [list(shares.values())] if self._comm is None else self._comm.allgather(list(shares.values()))
-        return {name: checksum.total(column) for name, column in zip(shares, zip(*rows, strict=True), strict=True)}
+        """The checksums of arrays, by name, from the shares of all ranks."""
+        of_ranks = self._comm.allgather(dict(shares))
+        return {name: checksum.total(of_rank[name] for of_rank in of_ranks) for name in shares}
 
     def _count(self) -> None:
-        """The sections of points and cells, and the rows of this rank in each."""
+        """Set the sections of points and of cells. Collective."""
         part, meshfree = self._part, [block for block in self._part.blocks if block.kind.meshfree]
         n_owned, n_efg = int(part.owned.sum()), int((part.owned & (part.nodes >= part.n_fe_nodes)).sum())
         self._points, self._n_points, _ = self._sections([None, *meshfree], n_owned, True)
         self._cells, self._n_cells, self._n_corners = self._sections(in_file_order(part.blocks), n_efg, False)
 
     def _sections(
-        self, blocks: Sequence[PartBlock | None], n_others: int, of_points: bool
+        self, blocks: Sequence[PartBlock | None], n_nodes: int, of_points: bool
     ) -> tuple[list[_Section], int, int]:
-        """Sections in order, with n_others rows in that without a block, and their rows and corners. Collective."""
-        n_own = np.array([[n_others if block is None else block.n_own for block in blocks]])
-        table = n_own if self._comm is None else np.concatenate(self._comm.allgather(n_own))
+        """Sections, one for each block in order, and the total numbers of rows and corners. Collective.
+
+        n_nodes: rows of this rank in the section without a block.
+        """
+        n_own = np.array([[n_nodes if block is None else block.n_own for block in blocks]])
+        table = np.concatenate(self._comm.allgather(n_own))
         totals, before = table.sum(axis=0), table[: self._part.part].sum(axis=0)
         corners = np.array([1 if block is None or block.kind.meshfree else block.n_nodes for block in blocks])
         row = np.cumsum(totals) - totals + before
         corner = np.cumsum(corners * totals) + corners * (before - totals)
-        # Data of points are in the order of the sections, data of cells in the order of the model.
+        # The data of points have the order of the sections, the data of cells have the order of the model.
         of_cells = [0 if block is None else block.first_own for block in blocks]
         data = np.cumsum(n_own[0]) - n_own[0] if of_points else of_cells
         columns = np.stack([corners, n_own[0], table.max(axis=0), row, corner, data], axis=1).tolist()
@@ -345,7 +348,7 @@ class ResultWriter:
         self._table(grid, "NumberOfConnectivityIds", [self._n_corners])
         part = self._part
         self._owned = np.flatnonzero(part.owned)
-        self._result_rows = part.read("rows")  # of this rank's nodes
+        self._result_rows = part.read("rows")  # rows of this rank's nodes in the file
         self._efg_rows = self._result_rows[part.owned & (part.nodes >= part.n_fe_nodes)]
         corners = [section._replace(row=section.corner) for section in self._cells]
         self._write_column(grid, "Connectivity", np.int64, (self._n_corners,), corners, self._connectivity)
@@ -362,11 +365,10 @@ class ResultWriter:
     def _write_column(
         self, grid: h5py.Group, name: str, dtype: Any, shape: tuple[int, ...], sections: Sequence[_Section], rows: Rows
     ) -> None:
-        made = _with_units(make(grid, name, shape, dtype))
-        self._shares[name] = self._write_sections(made, sections, rows)
+        self._shares[name] = self._write_sections(_with_units(make(grid, name, shape, dtype)), sections, rows)
 
     def _connectivity(self, section: _Section, first: int, last: int) -> NDArray[np.int64]:
-        """Points of cells."""
+        """Points of cells, one cell after another."""
         part, block = self._part, section.block
         if block is None:
             return self._efg_rows[first:last]
@@ -376,7 +378,7 @@ class ResultWriter:
         return self._result_rows[part.local(block.read("nodes", first, last))].ravel()
 
     def _offset_sections(self) -> list[_Section]:
-        """A first row with the start of the corners, and rows with the end of each cell's corners."""
+        """Sections of the dataset Offsets: 0, then the end of each cell's corners."""
         start = _Section(None, 0, int(self._leads), 1, 0, 0, 0)
         return [start, *(section._replace(row=section.row + 1) for section in self._cells)]
 
@@ -403,19 +405,14 @@ class ResultWriter:
         grid = self._file["VTKHDF"]
         steps = grid.create_group("Steps")
         steps.attrs["NSteps"] = np.int64(0)
-        # One row at first, so that its one chunk has its place in the file; later only the extent changes.
+        # One row allocates the only chunk; later only the extent changes.
         values = _with_units(make(steps, "Values", (1,), np.float64, maxshape=(n,), chunks=(n,)))
         if self._leads:
             values[...] = 0.0
         self._table(steps, "NumberOfParts", np.ones(n))
-        # The mesh and its data are the same in every step: all offsets into them are 0.
-        for name, shape in (
-            ("PartOffsets", n),
-            ("PointOffsets", n),
-            ("CellOffsets", (n, 1)),
-            ("ConnectivityIdOffsets", (n, 1)),
-        ):
-            self._table(steps, name, np.zeros(shape))
+        # The mesh and its data are the same in every step, so all their offsets are 0.
+        for name in ("PartOffsets", "PointOffsets", "CellOffsets", "ConnectivityIdOffsets"):
+            self._table(steps, name, np.zeros(n if name.startswith("P") else (n, 1)))
         for kind, n_rows, components in (("Point", self._n_points, point_data), ("Cell", self._n_cells, cell_data)):
             data, offsets = grid[f"{kind}Data"], steps.create_group(f"{kind}DataOffsets")
             for name in data:
@@ -431,7 +428,7 @@ class ResultWriter:
             self._table(steps, f"FieldDataSizes/{name}", np.ones((n, 2)))
 
     def _table(self, group: h5py.Group, name: str, values: Any) -> None:
-        """A small dataset of integers that all ranks make and the first writes."""
+        """Write a small dataset of integers: all ranks create it, and rank 0 writes the values."""
         dataset = make(group, name, np.shape(values), np.int64)
         values = np.asarray(values, np.int64)
         self._shares[dataset.name.removeprefix("/VTKHDF/")] = checksum.share(values, 0) if self._leads else 0
@@ -441,15 +438,15 @@ class ResultWriter:
     def _write_sections(
         self, dataset: h5py.Dataset, sections: Sequence[_Section], rows: Rows, first_row: int = 0
     ) -> int:
-        """Write the rows of each section in pieces; this rank's share of the checksum.
+        """Write the rows of each section in pieces; returns this rank's share of the checksum.
 
-        All ranks make as many calls as the rank with most rows. A copy of a whole column would be among the largest
-        arrays of a run.
+        All ranks make as many calls as the rank with the most rows. Pieces, because a complete column would be one of
+        the largest arrays of a run.
         """
         share = 0
         for section in sections:
             row = section.row
-            for begin in range(0, section.most, CHUNK_ROWS):
+            for begin in range(0, section.max_own, CHUNK_ROWS):
                 values = rows(section, min(begin, section.n_own), min(begin + CHUNK_ROWS, section.n_own))
                 share += write_rows(dataset, row, values, first_row, self._transfer)
                 row += len(values)
@@ -457,7 +454,7 @@ class ResultWriter:
 
 
 def _with_units(dataset: h5py.Dataset) -> h5py.Dataset:
-    """The dataset, with its unit as an attribute if there is one."""
+    """Add the unit of the dataset as an attribute; returns the dataset."""
     name = dataset.name.rpartition("/")[2]
     if name in UNITS:
         dataset.attrs["units"] = np.bytes_(UNITS[name])
