@@ -78,7 +78,7 @@ class Mesh:
     parts: tuple[Part, ...] = ()  # of the cloud, if known
     materials: dict[str, Material] = field(default_factory=dict)  # cell set -> material, from files
     constraints: tuple[Constraint, ...] = ()  # from files
-    remarks: tuple[str, ...] = ()  # one line each: what was skipped, merged or repaired
+    remarks: tuple[str, ...] = ()  # one line each: skipped, merged or repaired input
     figures: dict[str, float] = field(default_factory=dict)  # e.g. void_volume_m3
 
     @property

@@ -45,15 +45,15 @@ def flux_volume(points, faces):
 
 def test_parts_of_distorted_hexahedra_keep_volume_and_moments():
     points, hexahedra = distorted_block()
-    whole, centroids = volumes_and_centroids(points[hexahedra])
+    volumes, centroids = volumes_and_centroids(points[hexahedra])
     cuts = np.random.default_rng(1).integers(1, 4, (len(hexahedra), 3))
     parts, positions = volumes_and_centroids(subdivide(points[hexahedra], cuts))
     owner = np.repeat(np.arange(len(hexahedra)), cuts.prod(axis=1))
     # Round-off: sums of up to 27 parts.
-    np.testing.assert_allclose(np.bincount(owner, parts), whole, rtol=1e-13)
+    np.testing.assert_allclose(np.bincount(owner, parts), volumes, rtol=1e-13)
     for i in range(3):
-        np.testing.assert_allclose(np.bincount(owner, parts * positions[:, i]), whole * centroids[:, i], rtol=1e-12)
-    assert whole.sum() == pytest.approx(flux_volume(points, boundary_faces(hexahedra)), rel=1e-12)
+        np.testing.assert_allclose(np.bincount(owner, parts * positions[:, i]), volumes * centroids[:, i], rtol=1e-12)
+    assert volumes.sum() == pytest.approx(flux_volume(points, boundary_faces(hexahedra)), rel=1e-12)
 
 
 @pytest.mark.parametrize("per_spacing", [0.8, 1.0, 1.4, 2.0, 2.6])

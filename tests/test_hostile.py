@@ -75,7 +75,7 @@ def test_links_out_of_a_file_are_not_followed(model, name):
     secret = model.with_name("secret.h5")
     with h5py.File(secret, "w") as file:
         file["x"] = np.zeros((9, 3))
-    whole = model.read_bytes()
+    valid = model.read_bytes()
     layout = h5py.VirtualLayout((9, 3), "f8")
     layout[:] = h5py.VirtualSource(secret, "x", (9, 3))
 
@@ -92,7 +92,7 @@ def test_links_out_of_a_file_are_not_followed(model, name):
         (lambda file: file.create_virtual_dataset(name, layout), "are in another file"),
         (lambda file: file.create_dataset(name, data=["a"], dtype=h5py.string_dtype()), "other than numbers and text"),
     ):
-        model.write_bytes(whole)
+        model.write_bytes(valid)
         with h5py.File(model, "r+") as file:
             del file[name]
             put(file)
@@ -126,14 +126,14 @@ def test_strongly_compressed_integration_points_are_refused_by_their_memory(tmp_
 
 
 def test_indices_outside_their_arrays_are_refused(model):
-    whole = model.read_bytes()
+    valid = model.read_bytes()
     for name, value in (
         ("blocks/0/nodes", 10**9), ("blocks/1/nodes", -1), ("blocks/1/material", 7),
         ("field_domains", 10**6), ("prescribed_dofs", -3),
         ("partitions/2/nodes", 10**7), ("partitions/2/cells", 10**7), ("partitions/2/rows", 10**7),
         ("partitions/2/shared", 10**7), ("partitions/2/neighbours", 5), ("partitions/2/shared_offsets", 10**6),
     ):  # fmt: skip
-        model.write_bytes(whole)
+        model.write_bytes(valid)
         with h5py.File(model, "r+") as file:
             file[name][-1] = value
             file[name].attrs.pop("checksum", None)  # an attacker would write a correct checksum

@@ -109,14 +109,14 @@ def test_nodes_and_hexahedra_are_numbered_along_x(brain):
 
 
 def test_tumour_makes_a_void_in_tissue_only(brain):
-    whole, mesh = brain
-    np.testing.assert_array_equal(mesh.points[mesh.node_sets["skull"]], whole.points[whole.node_sets["skull"]])
+    intact, mesh = brain
+    np.testing.assert_array_equal(mesh.points[mesh.node_sets["skull"]], intact.points[intact.node_sets["skull"]])
     for name in ("left_ventricle", "right_ventricle"):
-        np.testing.assert_array_equal(mesh.points[mesh.node_sets[name]], whole.points[whole.node_sets[name]])
+        np.testing.assert_array_equal(mesh.points[mesh.node_sets[name]], intact.points[intact.node_sets[name]])
     assert n_pieces(mesh.hexahedra) == 1
     np.testing.assert_array_equal(np.unique(mesh.hexahedra), np.arange(mesh.n_fe_nodes))
     assert_partition(mesh)
-    dropped = len(whole.hexahedra) - len(mesh.hexahedra)
+    dropped = len(intact.hexahedra) - len(mesh.hexahedra)
     assert mesh.figures["void_volume_m3"] == pytest.approx(dropped * 0.005**3, rel=1e-12)
     seed_volume = 4 / 3 * np.pi * 0.002**3
     void = mesh.figures["void_volume_m3"] - seed_volume
@@ -127,9 +127,9 @@ def test_tumour_makes_a_void_in_tissue_only(brain):
     cavity = np.setdiff1d(np.unique(boundary_faces(mesh.hexahedra)), mesh.node_sets["skull"])
     np.testing.assert_array_equal(mesh.node_sets["interface"], cavity)
     # All tissue in the sphere of 18 mm, by centres of hexahedra.
-    middle = whole.points[whole.hexahedra].mean(axis=1)
+    middle = intact.points[intact.hexahedra].mean(axis=1)
     inside = np.linalg.norm(middle - CENTRE, axis=1) <= 0.018
-    assert dropped == np.count_nonzero(inside & np.isin(np.arange(len(middle)), whole.cell_sets["tissue"]))
+    assert dropped == np.count_nonzero(inside & np.isin(np.arange(len(middle)), intact.cell_sets["tissue"]))
 
 
 @pytest.mark.parametrize("element_size", [0.002, 0.003, 0.004])
@@ -246,15 +246,15 @@ def test_separate_pieces_cavities_and_a_ventricle_at_the_surface(tmp_path):
 
 
 def test_a_ventricle_within_the_void_stays_connected(tmp_path):
-    """A void of 19 mm holds the whole small right ventricle, which would be an island."""
+    """A void of 19 mm contains the small right ventricle, which would become an island."""
     data, affine = phantom(right=(4.0, 5.0, 4.0), gap=4.0)
     path = save(tmp_path / "p.nii", data, affine)
     seed = tumour((0.0115, 0.006, 0.007))
     mesh = mesh_labels(labels_of(path, 0.0025), deck.Cloud(radius=0.019), seed)
     assert n_pieces(mesh.hexahedra) == 1
-    whole = mesh_labels(labels_of(path, 0.0025), deck.Cloud(), None)
-    assert len(mesh.cell_sets["right_ventricle"]) == len(whole.cell_sets["right_ventricle"])
-    middle = whole.points[whole.hexahedra[whole.cell_sets["right_ventricle"]]].mean(axis=1)
+    intact = mesh_labels(labels_of(path, 0.0025), deck.Cloud(), None)
+    assert len(mesh.cell_sets["right_ventricle"]) == len(intact.cell_sets["right_ventricle"])
+    middle = intact.points[intact.hexahedra[intact.cell_sets["right_ventricle"]]].mean(axis=1)
     assert np.linalg.norm(middle - seed.centre, axis=1).max() < 0.019
 
 

@@ -23,6 +23,7 @@ from mpitled.deck import MeshFiles, load_deck
 from mpitled.errors import InputError
 from mpitled.laws import Material, NeoHookean
 from mpitled.mesh import Mesh, grid_points, structured_hexahedra
+from mpitled.model import Model
 from mpitled.model.build import build
 from mpitled.preview import overview
 from mpitled.readers import meshes, tables
@@ -368,6 +369,13 @@ def test_invalid_files_of_meshio_are_refused(tmp_path):
 # ------------------------------------------------------------ export
 
 
+def assert_equal_arrays(*models: Model) -> None:
+    one, other = map(store.model_arrays, models)
+    assert [*one] == [*other]
+    for name in one:
+        assert one[name].tobytes() == other[name].tobytes(), name
+
+
 def test_an_exported_model_runs_to_the_same_bits(tmp_path):
     """Block, core cloud, tumour, fixed, displaced and rotated sets, two materials."""
     (tmp_path / "scene.toml").write_text(GROWTH)
@@ -378,10 +386,7 @@ def test_an_exported_model_runs_to_the_same_bits(tmp_path):
     ]  # fmt: skip
     mpitled("run", tmp_path / "decks" / "scene.toml", "--out", tmp_path / "b")
     models = [store.read_model(tmp_path / x / "model.h5") for x in "ab"]
-    one, other = map(store.model_arrays, models)
-    assert [*one] == [*other]
-    for name in one:
-        assert one[name].tobytes() == other[name].tobytes(), name
+    assert_equal_arrays(*models)
     assert models[0].materials == models[1].materials
     assert not any("several steps" in remark for remark in models[1].remarks)
     assert models[0].surface_areas.tobytes() == models[1].surface_areas.tobytes()
@@ -430,10 +435,7 @@ def test_an_exported_model_of_one_kind_of_cell_is_the_same(tmp_path, cloud):
     mpitled("export", tmp_path / "a" / "model.h5", "--abaqus")
     mpitled("build", tmp_path / "a" / "export" / "scene.toml", "--out", tmp_path / "b")
     models = [store.read_model(tmp_path / x / "model.h5") for x in "ab"]
-    one, other = map(store.model_arrays, models)
-    assert [*one] == [*other]
-    for name in one:
-        assert one[name].tobytes() == other[name].tobytes(), name
+    assert_equal_arrays(*models)
 
 
 def test_a_changed_include_rebuilds_the_model(tmp_path):

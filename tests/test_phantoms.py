@@ -76,7 +76,7 @@ def test_cylinder_has_its_nodes_on_its_surface():
     np.testing.assert_array_equal(mesh.node_sets["surface"], np.unique(np.concatenate([bottom, top, side])))
 
 
-@pytest.mark.parametrize("tumour", [None, TUMOUR], ids=["whole", "cavity"])
+@pytest.mark.parametrize("tumour", [None, TUMOUR], ids=["intact", "cavity"])
 def test_ellipsoid_has_its_nodes_on_its_surface(tumour):
     """The sets patch and fixed end at nodes, so a tolerance in their definition changes nothing."""
     mesh = ellipsoid(tumour=tumour)
@@ -191,20 +191,20 @@ def test_sphere_of_cells(tmp_path):
         deck.load_deck(path, ["block.fitted=cist"])
 
 
-@pytest.mark.parametrize("tumour", [None, TUMOUR], ids=["whole", "tumour"])
+@pytest.mark.parametrize("tumour", [None, TUMOUR], ids=["intact", "tumour"])
 @pytest.mark.parametrize("cloud", ["core", "all"])
 def test_cloud_replaces_hexahedra(cloud, tumour):
     for mesher in (cylinder, ellipsoid):
         seed = tumour and deck.Tumour(centre=(0.005, 0.0, 0.05 if mesher is cylinder else 0.008), volume=523.6e-9)
-        whole, mesh = mesher(0.007, grading=1.0), mesher(0.007, cloud=cloud, tumour=seed, grading=1.0)
+        intact, mesh = mesher(0.007, grading=1.0), mesher(0.007, cloud=cloud, tumour=seed, grading=1.0)
         missing = SEED_VOLUME if seed else 0.0
         volume = mesh.integration_volumes.sum() + (fe_volume(mesh) if len(mesh.hexahedra) else 0.0)
-        assert volume == pytest.approx(fe_volume(whole) - missing, rel=1e-12)
+        assert volume == pytest.approx(fe_volume(intact) - missing, rel=1e-12)
         assert (mesh.n_fe_nodes > 0) == (cloud == "core")
         assert (len(mesh.node_sets["interface"]) > 0) == (cloud == "core")
-        for name, nodes in whole.node_sets.items():
+        for name, nodes in intact.node_sets.items():
             positions = {tuple(position) for position in mesh.points[mesh.node_sets[name]]}
-            assert positions == {tuple(position) for position in whole.points[nodes]}
+            assert positions == {tuple(position) for position in intact.points[nodes]}
 
 
 def test_core_ends_at_its_share_of_the_radius():
@@ -247,13 +247,13 @@ def test_constant_stress_is_in_balance_at_inner_nodes(tmp_path, shape, cloud):
 
 def test_a_hexahedron_is_the_seed_of_the_papers_mesh():
     """Its middle is the tumour's centre, the surface does not move, and the other cells stay valid."""
-    whole, mesh = ellipsoid(), ellipsoid(tumour=TUMOUR, cavity="moved")
+    intact, mesh = ellipsoid(), ellipsoid(tumour=TUMOUR, cavity="moved")
     seed = mesh.points[mesh.node_sets["tumour"]]
-    assert len(mesh.hexahedra) == len(whole.hexahedra) - 1
+    assert len(mesh.hexahedra) == len(intact.hexahedra) - 1
     assert seed.shape == (8, 3)
     assert np.abs(seed.mean(axis=0) - TUMOUR.centre).max() < ROUND_OFF
     surface = mesh.node_sets["surface"]
-    assert np.abs(mesh.points[surface] - whole.points[surface]).max() < ROUND_OFF
+    assert np.abs(mesh.points[surface] - intact.points[surface]).max() < ROUND_OFF
     assert hexahedra.scaled_jacobian(mesh.points, mesh.hexahedra).min() > 0.4
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from mpitled.errors import InputError
 from mpitled.mesh import Bools, Floats, Ints, Mesh, check_size, grid_points, hexahedral_mesh, structured_hexahedra
 from mpitled.meshing.cloud import build_cloud, near_centre
-from mpitled.meshing.o_grid import OGrid, shell_cells, whole_number
+from mpitled.meshing.o_grid import OGrid, at_least_one, shell_cells
 from mpitled.meshing.placement import format_position
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def _fitted(size: Floats, shape: Ints, centre: Floats, sphere: deck.Sphere, shar
     start = inner[o_grid.surface]
     ratio = ((high - low) / shape).mean() / width
     growth = max(np.log(ratio), _NEAR)
-    n = whole_number(np.linalg.norm(outer - start, axis=1).mean() / width * growth / np.expm1(growth))
+    n = at_least_one(np.linalg.norm(outer - start, axis=1).mean() / width * growth / np.expm1(growth))
     along = np.expm1(growth * np.arange(1, n + 1) / n)[:, None, None] / np.expm1(growth)
     layers = (1 - along) * start + along * outer
     nodes = np.concatenate([o_grid.surface, len(inner) + np.arange(n * len(start))]).reshape(n + 1, -1)

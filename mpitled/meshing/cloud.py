@@ -183,7 +183,7 @@ def _integrate(
 
 
 def _part(spheres: tuple[str, ...], integration_points: Ints, nodes: Ints, areas: Floats) -> Part:
-    """A part of the cloud with its nodes in ascending order; `areas` belong to the first nodes, others have none."""
+    """A part of the cloud with nodes in ascending order; `areas` belong to the first nodes, the rest has no area."""
     areas = np.concatenate([areas, np.zeros((len(nodes) - len(areas), 3))])
     order = np.argsort(nodes)
     return Part(spheres, integration_points, nodes[order], areas[order])

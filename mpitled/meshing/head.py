@@ -80,7 +80,7 @@ def voxelise(labels: deck.Labels) -> Head:
             f"warning: {key}: is smaller than a voxel of {image.path}, {1e3 * image.voxel.min():.3g} mm; smaller "
             "hexahedra show no more of the anatomy"
         )
-    if not image.placed:
+    if not image.has_position:
         remarks.append(
             f"warning: {image.path}: its header does not give the position of its voxels; check that left is left"
         )
@@ -174,7 +174,7 @@ def _manifold_patterns() -> Bools:
 
 
 def _manifold(mask: Mask, share: Floats) -> Mask:
-    """The mask with added cubes, those of largest share first, without non-manifold edges or vertices."""
+    """The mask with added cubes, largest share first, so that no non-manifold edge or vertex remains."""
     valid = _manifold_patterns()
     mask = without_cavities(mask)
     around = list(product((0, 1), repeat=3))

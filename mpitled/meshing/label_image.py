@@ -41,7 +41,7 @@ class Image:
     origin: Floats  # (3,), m: the first voxel's lowest corner
     voxel: Floats  # (3,), m: its edges along x, y, z
     to_world: Floats  # (3, 4), m: from the file's voxel indices (i, j, k, 1) to the world
-    placed: bool  # whether the header gives the position of the voxels in the world
+    has_position: bool  # whether the header gives the position of the voxels in the world
 
 
 def read_image(path: Path) -> Image:
@@ -60,7 +60,8 @@ def read_image(path: Path) -> Image:
     try:
         _check_header_size(path)
         image: Any = nibabel.load(path)
-        placed = any(int(image.header.get(name, 1)) for name in ("qform_code", "sform_code"))  # of NIfTI only
+        # Only NIfTI headers have these codes.
+        has_position = any(int(image.header.get(name, 1)) for name in ("qform_code", "sform_code"))
         if len(image.shape) > 3 and set(image.shape[3:]) == {1}:  # one volume with redundant axes
             image = nibabel.funcs.squeeze_image(image)
         if len(image.shape) != 3 or 0 in image.shape:
@@ -80,7 +81,7 @@ def read_image(path: Path) -> Image:
         raise InputError(f"{path}: holds values that are no integers; give labels, not intensities or probabilities")
     axes, corner = image.affine[:3, :3], image.affine[:3, 3]
     edges = np.diag(axes)
-    # A tilt that moves no voxel by more than half its size over the whole image is round-off of the header.
+    # A tilt that moves no voxel of the image by more than half its size is round-off of the header.
     tilt = np.abs(axes - np.diag(edges)) * np.array(data.shape)
     if not (edges > 0).all() or tilt.max() > 0.5 * edges.min():
         raise InputError(
@@ -98,7 +99,7 @@ def read_image(path: Path) -> Image:
         origin=(corner - edges / 2) * metre,
         voxel=edges * metre,
         to_world=to_world * metre,
-        placed=placed,
+        has_position=has_position,
     )
 
 

@@ -105,12 +105,12 @@ def _void(head: Head, radius: float, centre: Floats, needed: float) -> Mask:
 
 
 def _voxel_hint(head: Head, centre: Floats) -> str:
-    """A hint if the deck's numbers for the centre (3,), m, taken as voxel indices, lie in the solid; else ""."""
-    meant = head.to_world @ np.append(1e3 * centre, 1.0)
-    cube = head.grid.index(meant)
+    """A hint or "": the deck's numbers for the centre (3,), m, as voxel indices, lie in the solid."""
+    position = head.to_world @ np.append(1e3 * centre, 1.0)
+    cube = head.grid.index(position)
     if cube is None or not head.solid[cube]:
         return ""
-    return f"it looks like voxels: in mm it is {format_position(meant).removesuffix(' mm')}"
+    return f"it looks like voxels: in mm it is {format_position(position).removesuffix(' mm')}"
 
 
 def _alternative(grid: Grid, replaceable: Mask, centre: Floats, needed: float) -> str:

@@ -50,7 +50,7 @@ class OGrid:
         core = _CORE * level[:, None] * ((1 - bulge) * direction + bulge * on_sphere(direction))
         inner, outer = core[edge], on_sphere(self.cube)
         thickness = radius * (1 - np.linalg.norm(inner, axis=1).mean())
-        self.n_shells = whole_number(thickness / element_size)
+        self.n_shells = at_least_one(thickness / element_size)
         ends = graded(self.n_shells, outermost)
         share = ends[1:, None, None]
         self.points = np.concatenate([core, ((1 - share) * inner + share * outer).reshape(-1, d)])
@@ -117,6 +117,6 @@ def shell_cells(nodes: Ints, faces: Ints) -> Ints:
     return np.concatenate([nodes[:-1][:, faces], nodes[1:][:, faces]], axis=2).reshape(-1, 8)
 
 
-def whole_number(wanted: float) -> int:
-    """The nearest whole number, but at least 1."""
+def at_least_one(wanted: float) -> int:
+    """The nearest integer, but at least 1."""
     return max(1, int(np.floor(wanted + 0.5)))

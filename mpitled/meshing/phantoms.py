@@ -10,7 +10,7 @@ import numpy as np
 from mpitled.errors import InputError
 from mpitled.mesh import Bools, Floats, Ints, Mesh, check_size, hexahedral_mesh
 from mpitled.meshing.cloud import build_cloud, near_centre
-from mpitled.meshing.o_grid import OGrid, graded, on_sphere, shell_cells, whole_number
+from mpitled.meshing.o_grid import OGrid, at_least_one, graded, on_sphere, shell_cells
 from mpitled.meshing.placement import format_position
 
 if TYPE_CHECKING:
@@ -37,11 +37,11 @@ def cylinder_mesh(
         raise InputError('cylinder.cloud = "none": a tumour grows in a cloud; set it to "core" or "all"')
     size = _element_size(cylinder, cloud)
     check_size((np.pi * (cylinder.radius / size) ** 2 + 1) * (cylinder.height / size + 1), "cylinder.element_size")
-    n = 2 * whole_number(_ACROSS * cylinder.radius / (2 * size))
+    n = 2 * at_least_one(_ACROSS * cylinder.radius / (2 * size))
     # In a cloud, surface nodes should be as evenly spaced as inner nodes.
     grading = 1.0 if cylinder.cloud == "all" else cylinder.grading
     o_grid = OGrid((n, n), cylinder.radius, size, grading)
-    layers = whole_number(cylinder.height / size)
+    layers = at_least_one(cylinder.height / size)
     flat = cylinder.radius * o_grid.points
     share = graded(layers, grading, both_ends=True)
     z = cylinder.height * share
@@ -74,10 +74,10 @@ def ellipsoid_mesh(
     across = _ACROSS * axes / size + 4
     shells = axes.prod() ** (1 / 3) / size * 2 * (across * np.roll(across, 1)).sum()
     check_size(float(across.prod() + shells) / 4, "ellipsoid.element_size")
-    shape = np.array([4 * whole_number(_ACROSS * a / (4 * size)) for a in axes])
+    shape = np.array([4 * at_least_one(_ACROSS * a / (4 * size)) for a in axes])
     if tumour is not None and ellipsoid.cloud == "none" and ellipsoid.cavity == "fitted":
         check_size((tumour.surface_nodes / 6) ** 1.5, "tumour.surface_nodes")
-        shape = np.maximum(shape, 4 * whole_number(np.ceil((tumour.surface_nodes / 6) ** 0.5 / 4)))
+        shape = np.maximum(shape, 4 * at_least_one(np.ceil((tumour.surface_nodes / 6) ** 0.5 / 4)))
     grading = 1.0 if ellipsoid.cloud == "all" else ellipsoid.grading
     o_grid = OGrid(tuple(shape), float(axes.prod() ** (1 / 3)), size, grading, lines=grading)
     node_sets = {
@@ -143,7 +143,7 @@ def _fitted(outer: Floats, o_grid: OGrid, node_sets: dict[str, Ints], tumour: de
     reach = np.linalg.norm(outer - centre, axis=1)
     even = max(element_size / growth, seed)  # beyond this distance shells are equally thick
     ends = np.log(np.minimum(reach, even) / seed) / growth + np.maximum(reach - even, 0) / (growth * even)
-    n = whole_number(np.ceil(ends.mean()))
+    n = at_least_one(np.ceil(ends.mean()))
     check_size(float(n) * len(o_grid.faces), "ellipsoid.element_size")
     thicknesses = ends * np.arange(n + 1)[:, None] / n  # (shells, lines), distance in multiples of the thickness
     turn = np.log(even / seed) / growth

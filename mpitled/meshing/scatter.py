@@ -36,7 +36,7 @@ def scatter(cells: Floats, spacing: Spacing, occupied: Floats, irregularity: flo
 
 
 def fibonacci_sphere(n: int) -> Floats:
-    """Unit vectors (n, 3) of the Fibonacci lattice, whose points have equal areas (Gonzalez 2010)."""
+    """Unit vectors (n, 3) of the Fibonacci lattice, with equal areas around the points (Gonzalez 2010)."""
     i = np.arange(n) + 0.5
     polar, azimuth = np.arccos(1 - 2 * i / n), np.pi * (1 + 5**0.5) * i
     return np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=1)

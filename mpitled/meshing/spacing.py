@@ -59,7 +59,7 @@ class Spacing:
         return np.minimum(spacing, sizes[nearest] + _GROWTH_FROM_FACES * distance)
 
     def n_nodes(self, volume: float) -> float:
-        """Upper bound of the nodes in a volume, m^3: those of a ball around the seed, where nodes are densest."""
+        """Upper bound of the number of nodes in a volume, m^3: the number in a ball around the seed."""
         if self.centre is None:
             return volume / self.largest**3
         reach = np.cbrt(self.radius**3 + volume * 3 / (4 * np.pi))

@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpitled.cells import support_domains as support
 from mpitled.cells.hexahedra import nodal_mass, nodal_sum
 from mpitled.cells.kind import HEXAHEDRA, SUPPORT_DOMAINS
 from mpitled.deck import Deck
 from mpitled.laws import Material
-from mpitled.mesh import Mesh
+from mpitled.mesh import Floats, Ints, Mesh
 from mpitled.meshing import checks
 from mpitled.model import CellBlock, Model, ModelFigures
 from mpitled.model import remarks as warnings
@@ -94,9 +93,7 @@ def discretise(deck: Deck, mesh: Mesh) -> Model:
     )
 
 
-def _masses(
-    blocks: tuple[CellBlock, ...], materials: tuple[Material, ...], points: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], float]:
+def _masses(blocks: tuple[CellBlock, ...], materials: tuple[Material, ...], points: Floats) -> tuple[Floats, float]:
     """Masses (n_nodes,) of the nodes, kg (eq. 4.17 and 4.18), and their sum."""
     density = np.array([material.density for material in materials])
     of_cells = [density[block.material] * block.volumes(points) for block in blocks]
@@ -105,12 +102,8 @@ def _masses(
 
 
 def _critical_steps(
-    deck: Deck,
-    blocks: tuple[CellBlock, ...],
-    materials: tuple[Material, ...],
-    points: NDArray[np.float64],
-    mass: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], float]:
+    deck: Deck, blocks: tuple[CellBlock, ...], materials: tuple[Material, ...], points: Floats, mass: Floats
+) -> tuple[Floats, float]:
     """Estimates (n_nodes,) of the critical time step of each node, s, and the volume of the body, m^3."""
     modulus = np.array([material.p_wave_modulus for material in materials])
     # k gamma^T gamma = R (lambda + 2 mu) V (B:B) on a box
@@ -124,8 +117,8 @@ def _critical_steps(
     return 2 * np.sqrt(mass / stiffness), volume
 
 
-def _typical(critical: NDArray[np.float64], prescribed: NDArray[np.int64], in_domains: NDArray[np.int64]) -> float:
-    """Median, s, of the critical steps (n_nodes,) of free nodes, outside the cloud if there are free nodes outside.
+def _typical(critical: Floats, prescribed: Ints, in_domains: Ints) -> float:
+    """Median, s, of the critical steps (n_nodes,) of free nodes, outside the cloud if possible.
 
     The cloud is fine next to a seed: mass scaling of a few nodes costs less than a short step for the whole model.
     """

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.sparse as sparse
-from numpy.typing import NDArray
 
 from mpitled.cells.hexahedra import nodal_sum
 from mpitled.cells.support_domains import linear_projector
-from mpitled.mesh import Mesh
+from mpitled.mesh import Bools, Floats, Ints, Mesh
 from mpitled.model.scene import OUTER, TUMOUR, members
 from mpitled.model.two_level import TwoLevel, solve
 
@@ -17,12 +16,8 @@ _BALANCED = 1e-15
 
 
 def consistent_gradients(
-    mesh: Mesh,
-    domains: NDArray[np.int64],
-    gradients: NDArray[np.float64],
-    fe_balance: NDArray[np.float64],
-    prescribed: NDArray[np.int64],
-) -> tuple[NDArray[np.float64], dict[str, float]]:
+    mesh: Mesh, domains: Ints, gradients: Floats, fe_balance: Floats, prescribed: Ints
+) -> tuple[Floats, dict[str, float]]:
     """Gradients with which a constant stress is in balance in each part of the cloud, and the worst part's figures.
 
     The stress jumps from part to part, so each part needs its own balance. The traction is equal on both sides of an
@@ -47,9 +42,7 @@ def consistent_gradients(
     return corrected, figures
 
 
-def _surface(
-    mesh: Mesh, fe_balance: NDArray[np.float64], prescribed: NDArray[np.int64]
-) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+def _surface(mesh: Mesh, fe_balance: Floats, prescribed: Ints) -> tuple[Bools, Floats]:
     """Nodes (n_nodes,) with a known surface integral of a constant stress, and the integrals (n_nodes, 3), m^2.
 
     At nodes of hexahedra only, the integral is fe_balance. Inside the cloud it is zero. On the cloud's boundary the
@@ -72,13 +65,8 @@ def _surface(
 
 
 def correct_consistency(
-    nodes: NDArray[np.float64],
-    domains: NDArray[np.int64],
-    gradients: NDArray[np.float64],
-    volumes: NDArray[np.float64],
-    fe_balance: NDArray[np.float64],
-    free: NDArray[np.bool_],
-) -> tuple[NDArray[np.float64], dict[str, float]]:
+    nodes: Floats, domains: Ints, gradients: Floats, volumes: Floats, fe_balance: Floats, free: Bools
+) -> tuple[Floats, dict[str, float]]:
     """Gradients (G, n, 3) with which a constant stress is in balance at the free nodes, and figures of the correction.
 
     Integration by parts demands sum_g V_g B_ga + fe_balance_a = 0 at an inner node a. Least squares violate it, so the
@@ -120,13 +108,7 @@ def correct_consistency(
     return corrected, figures | {"consistency_after": after, "consistency_change": change}
 
 
-def _assemble(
-    domains: NDArray[np.int64],
-    centred: NDArray[np.float64],
-    inverse: NDArray[np.float64],
-    volumes: NDArray[np.float64],
-    n_nodes: int,
-) -> sparse.csr_matrix:
+def _assemble(domains: Ints, centred: Floats, inverse: Floats, volumes: Floats, n_nodes: int) -> sparse.csr_matrix:
     """The sum of V Q over all domains (G, n); centred and inverse as in `linear_projector`.
 
     Q = 1 - M^T M. The four rows of M are an orthonormal basis of affine fields, so no matrix of a domain is stored.

@@ -14,20 +14,20 @@ from mpitled import resources
 from mpitled.cells.support_domains import moving_least_squares, worst_condition
 from mpitled.deck import Deck
 from mpitled.errors import InputError
-from mpitled.mesh import Mesh, Part
+from mpitled.mesh import Bools, Floats, Ints, Mesh, Part
 from mpitled.model.scene import TUMOUR, members
 
 _CHUNK = 1 << 14  # domains computed at once; bounds the temporary memory
 
 #: Mask (n_nodes,), and the maximum number of its nodes in a domain.
-Limit = tuple[NDArray[np.bool_], int]
+Limit = tuple[Bools, int]
 
 
 @dataclass(frozen=True, slots=True)
 class FoundDomains:
     """Nodes of the support domains, and counts of the search."""
 
-    domains: NDArray[np.int64]  # (n_domains, n)
+    domains: Ints  # (n_domains, n)
     limited: int  # domains that do not hold their n nearest nodes because of a limit
     added: int  # memberships added to bring each wanted node into enough domains
 
@@ -35,7 +35,7 @@ class FoundDomains:
 # --- the domains of a mesh ------------------------------------------------------------------------------------------
 
 
-def domains_of_mesh(deck: Deck, mesh: Mesh, material: NDArray[np.int16]) -> tuple[NDArray[np.int64], dict[str, int]]:
+def domains_of_mesh(deck: Deck, mesh: Mesh, material: NDArray[np.int16]) -> tuple[Ints, dict[str, int]]:
     """Nodes (n_integration, k) of the support domains, and figures of the search, see `ModelFigures`.
 
     A domain takes its nodes from its own part of the cloud and from hexahedra of its own material. A fit across the
@@ -85,7 +85,7 @@ def _parts(mesh: Mesh) -> tuple[Part, ...]:
     return (Part((), points, nodes, np.zeros((len(nodes), 3))),)
 
 
-def _limits(deck: Deck, mesh: Mesh) -> tuple[list[Limit], NDArray[np.bool_]]:
+def _limits(deck: Deck, mesh: Mesh) -> tuple[list[Limit], Bools]:
     """Limits of the nodes in a support domain, and the nodes that must be in enough domains.
 
     At most half of a domain's nodes may lie on the seed's surface: a domain with these nodes only would expand by
@@ -100,7 +100,7 @@ def _limits(deck: Deck, mesh: Mesh) -> tuple[list[Limit], NDArray[np.bool_]]:
     return [(fe, deck.support.max_fe_nodes), (seed, deck.support.nodes // 2)], coupled
 
 
-def without_orphans(deck: Deck, mesh: Mesh, domains: NDArray[np.int64]) -> tuple[Mesh, NDArray[np.int64], int]:
+def without_orphans(deck: Deck, mesh: Mesh, domains: Ints) -> tuple[Mesh, Ints, int]:
     """The mesh and the domains without EFG nodes that are in no domain, and the number of these nodes.
 
     These nodes have no mass (4.1.7). InputError if a node of the interface is in no domain.
@@ -118,7 +118,7 @@ def without_orphans(deck: Deck, mesh: Mesh, domains: NDArray[np.int64]) -> tuple
     return mesh, domains, len(orphans)
 
 
-def _without_nodes(nodes: NDArray[np.int64], mesh: Mesh, domains: NDArray[np.int64]) -> tuple[Mesh, NDArray[np.int64]]:
+def _without_nodes(nodes: Ints, mesh: Mesh, domains: Ints) -> tuple[Mesh, Ints]:
     """The mesh without these EFG nodes, and the domains in the new numbers."""
     keep = np.ones(mesh.n_nodes, bool)
     keep[nodes] = False
@@ -150,12 +150,7 @@ def _without_nodes(nodes: NDArray[np.int64], mesh: Mesh, domains: NDArray[np.int
 
 
 def find_domains(
-    points: NDArray[np.float64],
-    at: NDArray[np.float64],
-    n: int,
-    limits: Sequence[Limit] = (),
-    wanted: NDArray[np.bool_] | None = None,
-    min_domains: int = 3,
+    points: Floats, at: Floats, n: int, limits: Sequence[Limit] = (), wanted: Bools | None = None, min_domains: int = 3
 ) -> FoundDomains:
     """The n nodes nearest to each integration point, subject to the limits.
 
@@ -206,7 +201,7 @@ def find_domains(
     return FoundDomains(domains, limited, added)
 
 
-def _nearest(tree: cKDTree, at: NDArray[np.float64], k: int) -> NDArray[np.int64]:
+def _nearest(tree: cKDTree, at: Floats, k: int) -> Ints:
     """The k nearest points (n, k), ordered by distance; points at equal distances are ordered by number."""
     distance, index = tree.query(at, k)
     distance, index = distance.reshape(len(at), k), index.reshape(len(at), k)
@@ -250,14 +245,7 @@ def _add_memberships(domains, counts, points, at, poor, near, wanted, masks, max
     return added
 
 
-def repair(
-    points: NDArray[np.float64],
-    at: NDArray[np.float64],
-    domains: NDArray[np.int64],
-    basis: int,
-    weight: str,
-    limits: Sequence[Limit] = (),
-) -> int:
+def repair(points: Floats, at: Floats, domains: Ints, basis: int, weight: str, limits: Sequence[Limit] = ()) -> int:
     """Exchange nodes of domains with a singular or badly conditioned moment matrix; returns the number of such domains.
 
     The farthest nodes are exchanged one after the other, each for the nearest further node that repairs the domain, or

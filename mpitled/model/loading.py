@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mpitled.mesh import Rotation
+from mpitled.mesh import Floats, Rotation
 
 
 def loading_curve(share: float) -> float:
@@ -19,20 +18,18 @@ def sphere_radius(volume: float) -> float:
     return float(np.cbrt(3 * volume / (4 * np.pi)))
 
 
-def growth(
-    points: NDArray[np.float64], centre: NDArray[np.float64], seed_radius: float, volume: float
-) -> NDArray[np.float64]:
+def growth(points: Floats, centre: Floats, seed_radius: float, volume: float) -> Floats:
     """Radial displacement (n, 3), m at full load, of nodes (n, 3), m, on the seed's surface to a sphere of that volume.
 
-    In a mesh that does not follow the seed, nodes are beside its surface. They move as incompressible tissue does: the
-    cube of the distance from the centre grows by R^3 - r0^3.
+    If a mesh does not follow the seed's surface, the nodes move as incompressible tissue does: the cube of the distance
+    from the centre grows by R^3 - r0^3.
     """
     cubed = ((points - centre) ** 2).sum(axis=1) ** 1.5
     grown = np.cbrt(cubed + sphere_radius(volume) ** 3 - seed_radius**3)
     return (grown / np.cbrt(cubed) - 1)[:, None] * (points - centre)
 
 
-def rotation_path(points: NDArray[np.float64], rotation: Rotation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def rotation_path(points: Floats, rotation: Rotation) -> tuple[Floats, Floats]:
     """Displacements (n, 3), m at full load, of rotated points (n, 3), m, and their paths (n, 3, 3).
 
     The last axis of the paths is, for each direction, the angle phi in rad, the arm r from the axis and e x r, both in

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpitled.errors import InputError
+from mpitled.mesh import Floats
 from mpitled.readers import tables
 
 _POINTS = 20  # points in a fit: two for each of the ten monomials
@@ -21,7 +21,7 @@ _FLAT = 1e-4
 _CHUNK = 1 << 12  # nodes computed at once; bounds the temporary memory
 
 
-def carry_over(path: Path, metre: float, nodes: NDArray[np.float64], origin: str) -> NDArray[np.float64]:
+def carry_over(path: Path, metre: float, nodes: Floats, origin: str) -> Floats:
     """Displacements (n, 3), m, at nodes (n, 3), m, from a CSV of x, y, z, ux, uy, uz in units of `metre` m.
 
     A displacement is the value of the quadratic polynomial fitted to the 20 nearest points, weighted by a quartic
@@ -56,12 +56,7 @@ def carry_over(path: Path, metre: float, nodes: NDArray[np.float64], origin: str
     return result
 
 
-def _fitted(
-    nodes: NDArray[np.float64],
-    points: NDArray[np.float64],
-    values: NDArray[np.float64],
-    distance: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def _fitted(nodes: Floats, points: Floats, values: Floats, distance: Floats) -> Floats:
     """Values (n, 3) at nodes (n, 3) of polynomials fitted to values (n, k, 3) at points (n, k, 3)."""
     radius = 1.001 * distance[:, -1:]
     x, y, z = ((points - nodes[:, None]) / radius[..., None]).transpose(2, 0, 1)

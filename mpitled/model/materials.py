@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from mpitled.deck import Deck
 from mpitled.errors import InputError
 from mpitled.laws import Material
-from mpitled.mesh import Mesh, named_set
+from mpitled.mesh import Bools, Mesh, named_set
 from mpitled.meshing import label_image
 
 
@@ -24,7 +24,7 @@ def assign_materials(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int16], tuple[M
     materials = list(dict.fromkeys(material for _, material in claims))
     assigned = np.full(mesh.n_cells, -1, np.int16)
 
-    def fill(name: str, material: Material, origin: str, open_cells: NDArray[np.bool_]) -> None:
+    def fill(name: str, material: Material, origin: str, open_cells: Bools) -> None:
         cells = np.arange(mesh.n_cells) if name == "all" else named_set(mesh.cell_sets, name, origin)
         cells = cells[open_cells[cells]]
         n_twice = np.count_nonzero(assigned[cells] >= 0)

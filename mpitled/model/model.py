@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mpitled.cells.kind import KINDS, CellKind
 from mpitled.laws import Material
+from mpitled.mesh import Floats, Ints
 
 #: Prefix of a remark that is a warning; other remarks are notes.
 WARNING = "warning: "
@@ -21,20 +22,18 @@ class CellBlock:
 
     name: str
     kind: CellKind
-    nodes: NDArray[np.int64]  # (n, k), global nodes of each cell
+    nodes: Ints  # (n, k), global nodes of each cell
     material: NDArray[np.int16]  # (n,), index into the materials of the model
-    columns: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # (n, ...), see `CellKind.columns`
+    columns: dict[str, Floats] = field(default_factory=dict)  # (n, ...), see `CellKind.columns`
 
     def __len__(self) -> int:
         return len(self.nodes)
 
-    def volumes(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def volumes(self, points: Floats) -> Floats:
         """Exact volumes (n,), m^3; points (n_nodes, 3), m, of the model."""
         return self.kind.exact_volumes(points, self.nodes) if self.kind.exact_volumes else self.columns["volumes"]
 
-    def geometry(
-        self, points: NDArray[np.float64], rule: str = "mean"
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def geometry(self, points: Floats, rule: str = "mean") -> tuple[Floats, Floats]:
         """Gradients (n, k, 3), 1/m, and volumes (n,), m^3, of the one integration point; rule: of hexahedra."""
         if self.kind.geometry:
             return self.kind.geometry(points, self.nodes, rule)
@@ -65,7 +64,7 @@ class ModelFigures:
     consistency_before: float | None = None  # largest imbalance of a constant stress, relative; None without a cloud
     consistency_after: float | None = None
     consistency_change: float | None = None  # of the gradients, relative
-    of_mesh: dict[str, float] = field(default_factory=dict)  # the mesher's own numbers by name
+    of_mesh: dict[str, float] = field(default_factory=dict)  # numbers of the mesher by name
 
     def flat(self) -> dict[str, float]:
         """All numbers by name, first those of the mesher; None is left out."""
@@ -80,21 +79,21 @@ class Model:
     Nodes are FE nodes first, then EFG nodes. Cells are numbered block after block.
     """
 
-    points: NDArray[np.float64]  # (n_nodes, 3), m
+    points: Floats  # (n_nodes, 3), m
     n_fe_nodes: int
-    node_ids: NDArray[np.int64]  # (n_nodes,), node numbers in the input file
+    node_ids: Ints  # (n_nodes,), node numbers in the input file
     blocks: tuple[CellBlock, ...]
     field_block: str  # name of the block that interpolates the field at EFG nodes; "" without EFG nodes
-    field_domains: NDArray[np.int64]  # (n_efg_nodes,), the cell of that block that gives the field at an EFG node
-    field_shapes: NDArray[np.float64]  # (n_efg_nodes, k), its MLS shape functions there
+    field_domains: Ints  # (n_efg_nodes,), cell of this block that gives the field at the node
+    field_shapes: Floats  # (n_efg_nodes, k), MLS shape functions of the cell at the node
     materials: tuple[Material, ...]
-    mass: NDArray[np.float64]  # (n_nodes,), kg
-    prescribed_dofs: NDArray[np.int64]  # (n_prescribed,), 3 node + direction, ascending
-    prescribed_displacements: NDArray[np.float64]  # (n_prescribed,), m at full load; 0 where fixed
-    rotation_paths: NDArray[np.float64]  # (n_prescribed, 3), see `loading.rotation_path`; 0 where the path is straight
-    node_sets: dict[str, NDArray[np.int64]]
-    cell_sets: dict[str, NDArray[np.int64]]
-    surface_areas: NDArray[np.float64] | None = None  # (n_nodes, 3), m^2, as in the mesh: for the export
+    mass: Floats  # (n_nodes,), kg
+    prescribed_dofs: Ints  # (n_prescribed,), 3 node + direction, ascending
+    prescribed_displacements: Floats  # (n_prescribed,), m at full load; 0 where fixed
+    rotation_paths: Floats  # (n_prescribed, 3), see `loading.rotation_path`; 0 where the path is straight
+    node_sets: dict[str, Ints]
+    cell_sets: dict[str, Ints]
+    surface_areas: Floats | None = None  # (n_nodes, 3), m^2, as in the mesh: for the export
     figures: ModelFigures = field(default_factory=ModelFigures)
     remarks: tuple[str, ...] = ()  # one line each: skipped, merged, repaired or suspicious input
 
@@ -127,12 +126,12 @@ class Model:
         nodes, material = (np.concatenate([getattr(block, a) for block in of_kind]) for a in ("nodes", "material"))
         return replace(of_kind[0], name=kind, nodes=nodes, material=material, columns=columns)
 
-    def cells_of(self, kind: str) -> NDArray[np.int64]:
+    def cells_of(self, kind: str) -> Ints:
         """Numbers, ascending, of the cells of a kind, in the order of `of_kind`."""
         numbers = [np.arange(cells.start, cells.stop) for cells, block in self.numbered() if block.kind.name == kind]
         return np.concatenate([np.empty(0, np.int64), *numbers])
 
-    def rows_of(self, kind: str, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    def rows_of(self, kind: str, cells: Ints) -> Ints:
         """Rows of `of_kind` of the cells (ascending) that are of the kind."""
         return np.flatnonzero(np.isin(self.cells_of(kind), cells))
 
@@ -141,7 +140,7 @@ class Model:
         cells, block = next((cells, block) for cells, block in self.numbered() if cell < cells.stop)
         return block, cell - cells.start
 
-    def at_cells(self, nodal: NDArray[np.float64], at_points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def at_cells(self, nodal: Floats, at_points: Floats) -> Floats:
         """Cell values (n_cells, ...): nodal means (n_nodes, ...) in solids, `at_points` in mesh-free cells."""
         values, first = [], 0
         for block in self.blocks:
@@ -153,32 +152,32 @@ class Model:
         return np.concatenate(values)
 
     @property
-    def hexahedra(self) -> NDArray[np.int64]:
+    def hexahedra(self) -> Ints:
         """(n_hexahedra, 8), nodes of all hexahedra, in Abaqus/VTK order."""
         return self.of_kind("hexahedra").nodes
 
     @property
-    def domains(self) -> NDArray[np.int64]:
+    def domains(self) -> Ints:
         """(n_domains, k), nodes of all support domains."""
         return self.of_kind("support domains").nodes
 
     @property
-    def domain_points(self) -> NDArray[np.float64]:
+    def domain_points(self) -> Floats:
         """(n_domains, 3), m, integration points."""
         return self.of_kind("support domains").columns["points"]
 
     @property
-    def domain_volumes(self) -> NDArray[np.float64]:
+    def domain_volumes(self) -> Floats:
         """(n_domains,), m^3."""
         return self.of_kind("support domains").columns["volumes"]
 
     @property
-    def domain_gradients(self) -> NDArray[np.float64]:
+    def domain_gradients(self) -> Floats:
         """(n_domains, k, 3), 1/m."""
         return self.of_kind("support domains").columns["gradients"]
 
     @property
-    def domain_shapes(self) -> NDArray[np.float64]:
+    def domain_shapes(self) -> Floats:
         """(n_domains, k), MLS shape functions at the integration points."""
         return self.of_kind("support domains").columns["shapes"]
 
@@ -188,7 +187,7 @@ class Model:
         return np.concatenate([np.empty(0, np.int16), *(block.material for block in self.blocks)])
 
     @property
-    def volumes(self) -> NDArray[np.float64]:
+    def volumes(self) -> Floats:
         """(n_cells,), m^3."""
         return np.concatenate([np.empty(0), *(block.volumes(self.points) for block in self.blocks)])
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mpitled.deck import Deck
 from mpitled.errors import InputError
-from mpitled.mesh import Constraint, Mesh, named_set
+from mpitled.mesh import Constraint, Floats, Ints, Mesh, named_set
 from mpitled.meshing.placement import format_length
 from mpitled.model.loading import growth, rotation_path, sphere_radius
 from mpitled.model.mapping import carry_over
@@ -20,9 +20,9 @@ from mpitled.model.scene import OUTER, TUMOUR, members
 class Prescribed(NamedTuple):
     """Prescribed dofs and displacements, and their origins."""
 
-    dofs: NDArray[np.int64]  # (n,), 3 node + direction, ascending
-    displacements: NDArray[np.float64]  # (n,), m at full load
-    rotation_paths: NDArray[np.float64]  # (n, 3), see `loading.rotation_path`
+    dofs: Ints  # (n,), 3 node + direction, ascending
+    displacements: Floats  # (n,), m at full load
+    rotation_paths: Floats  # (n, 3), see `loading.rotation_path`
     origins: NDArray[np.object_]  # (n,), file and line, or key
 
 
@@ -59,7 +59,7 @@ def prescribe(deck: Deck, mesh: Mesh) -> tuple[Prescribed, list[str]]:
     return Prescribed(*(values[order] for values in both)), remarks
 
 
-def check_growth(deck: Deck, mesh: Mesh, dofs: NDArray[np.int64], displacements: NDArray[np.float64]) -> None:
+def check_growth(deck: Deck, mesh: Mesh, dofs: Ints, displacements: Floats) -> None:
     """InputError if the grown tumour reaches beyond fixed nodes of the outer surface."""
     if deck.tumour is None:
         return
@@ -77,7 +77,7 @@ def check_growth(deck: Deck, mesh: Mesh, dofs: NDArray[np.int64], displacements:
 
 
 #: Dofs (n,), their displacements (n,), rotation paths (n, 3), and the file or key that prescribes them.
-_Motion = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], str]
+_Motion = tuple[Ints, Floats, Floats, str]
 
 
 def _motions(mesh: Mesh, constraints: Iterable[Constraint]) -> list[_Motion]:

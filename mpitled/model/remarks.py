@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mpitled.deck import Deck
 from mpitled.laws import Material
-from mpitled.mesh import Mesh
+from mpitled.mesh import Ints, Mesh
 from mpitled.meshing.placement import format_length, format_position, unit_hint
 from mpitled.model.loading import sphere_radius
 from mpitled.model.scene import OUTER, TUMOUR, centroids, members
@@ -53,7 +53,7 @@ def unit_warnings(
         yield f"warning: {key}: is softer than any tissue that a tumour grows in; moduli are in Pa"
 
 
-def unconstrained_warning(mesh: Mesh, dofs: NDArray[np.int64]) -> Iterator[str]:
+def unconstrained_warning(mesh: Mesh, dofs: Ints) -> Iterator[str]:
     """A warning if only nodes of the tumour are prescribed."""
     seed = members(mesh, TUMOUR)
     names = [name for name in OUTER if name in mesh.node_sets]

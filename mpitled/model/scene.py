@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpitled.deck import Deck, Sphere
 from mpitled.errors import InputError
-from mpitled.mesh import Mesh
+from mpitled.mesh import Floats, Ints, Mesh
 from mpitled.meshing import block, labels, phantoms
 from mpitled.meshing.placement import in_sphere
 
@@ -45,12 +44,12 @@ def read_mesh(deck: Deck) -> Mesh:
     return replace(mesh, cell_sets=cell_sets)
 
 
-def members(mesh: Mesh, name: str) -> NDArray[np.int64]:
+def members(mesh: Mesh, name: str) -> Ints:
     """Nodes of a set; none if there is no such set."""
     return mesh.node_sets.get(name, np.empty(0, np.int64))
 
 
-def centroids(mesh: Mesh) -> NDArray[np.float64]:
+def centroids(mesh: Mesh) -> Floats:
     """Midpoints of hexahedra and positions of integration points, (n_cells, 3), m."""
     # The middle of one diagonal: the corners of all cells would be the largest array while a model is built.
     of_hexahedra = (mesh.points[mesh.hexahedra[:, 0]] + mesh.points[mesh.hexahedra[:, 6]]) / 2

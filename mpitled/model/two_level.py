@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sparse
 import scipy.sparse.linalg as linalg
-from numpy.typing import NDArray
+
+from mpitled.mesh import Floats
 
 #: Minimum nodes of an aggregate, and maximum coarse unknowns (four for each aggregate): these are solved directly.
 _MIN_NODES, _MAX_UNKNOWNS = 96, 12_000
@@ -22,7 +23,7 @@ class TwoLevel:
     Mandel and Brezina 1996).
     """
 
-    def __init__(self, system: sparse.csr_matrix, points: NDArray[np.float64]) -> None:
+    def __init__(self, system: sparse.csr_matrix, points: Floats) -> None:
         """system (n, n), symmetric and positive semi-definite; points (n, 3): positions of its unknowns."""
         n = len(points)
         diagonal = system.diagonal()
@@ -52,7 +53,7 @@ class TwoLevel:
             x /= value
         return 1.1 * value
 
-    def __call__(self, residual: NDArray[np.float64]) -> NDArray[np.float64]:
+    def __call__(self, residual: Floats) -> Floats:
         """The approximate solution (n, k) for right-hand sides (n, k)."""
         scale = self._weight * self._inverse
         x = scale * residual
@@ -60,12 +61,12 @@ class TwoLevel:
         x += scale * (residual - self.system @ x)
         return self.without_affine(x)
 
-    def without_affine(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def without_affine(self, x: Floats) -> Floats:
         """x (n, k) without its part in the null space of the system."""
         return np.subtract(x, self._affine @ (self._affine.T @ x), dtype=np.float64)
 
 
-def _affine_pieces(points: NDArray[np.float64], size: int) -> sparse.csr_matrix:
+def _affine_pieces(points: Floats, size: int) -> sparse.csr_matrix:
     """(n, 4 m): 1, x, y, z on each of m aggregates of about `size` nodes; halved repeatedly along x, y, z in turn."""
     n = len(points)
     group = np.zeros(n, np.int64)
@@ -87,12 +88,8 @@ def _affine_pieces(points: NDArray[np.float64], size: int) -> sparse.csr_matrix:
 
 
 def solve(
-    system: sparse.csr_matrix,
-    right: NDArray[np.float64],
-    preconditioner: TwoLevel,
-    tolerance: NDArray[np.float64],
-    max_iterations: int = 1000,
-) -> NDArray[np.float64]:
+    system: sparse.csr_matrix, right: Floats, preconditioner: TwoLevel, tolerance: Floats, max_iterations: int = 1000
+) -> Floats:
     """Solution (n, k) for right-hand sides (n, k), by conjugate gradients; tolerance (k,): norms of the residuals."""
     x = np.zeros_like(right)
     residual = preconditioner.without_affine(right)

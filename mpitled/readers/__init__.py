@@ -1,1 +1,1 @@
-"""Meshes made by other programs, read into one form."""
+"""Readers of mesh files of other programs."""

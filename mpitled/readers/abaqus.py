@@ -32,7 +32,7 @@ _HARMLESS = {
     "ENERGYOUTPUT", "NODEPRINT", "ELPRINT", "CONTACTPRINT", "ENERGYPRINT", "NODEFILE", "ELFILE", "CONTACTFILE",
     "FILEFORMAT", "MONITOR",
 }  # fmt: skip
-#: Unsupported keywords that tie, load or move parts, beside CONTACT... and CONNECTOR...
+#: Unsupported keywords that tie, load or move parts, except CONTACT... and CONNECTOR...
 _REFUSED = {
     "TIE", "MPC", "EQUATION", "COUPLING", "KINEMATICCOUPLING", "DISTRIBUTINGCOUPLING", "RIGIDBODY", "EMBEDDEDELEMENT",
     "SHELLTOSOLIDCOUPLING", "TRANSFORM", "SPRING", "DASHPOT", "MASS", "ROTARYINERTIA", "CONNECTORSECTION",
@@ -156,14 +156,14 @@ class _Reader:
     def _system(self, keyword: Keyword) -> None:
         rows = keyword.numbers(2)
         given = [value for _, row in rows for value in row][:9]
-        origin, along, beside = np.pad(given, (0, 9 - len(given))).reshape(3, 3)
+        origin, on_axis, in_plane = np.pad(given, (0, 9 - len(given))).reshape(3, 3)
         if not given:
             self.system = None
         elif len(given) <= 3:
             self.system = np.eye(3), origin
         else:
-            first = along - origin
-            third = np.cross(first, beside - origin) if len(given) > 6 else np.cross(first, [-first[1], first[0], 0])
+            first = on_axis - origin
+            third = np.cross(first, in_plane - origin) if len(given) > 6 else np.cross(first, [-first[1], first[0], 0])
             if not (first.any() and third.any()):
                 keyword.fail("has collinear points; correct them")
             first, third = first / np.linalg.norm(first), third / np.linalg.norm(third)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpitled.errors import InputError
-from mpitled.mesh import Constraint, Ints
+from mpitled.mesh import Constraint, Floats, Ints
 from mpitled.readers import meshfile, text
 from mpitled.readers.meshfile import Cells, FileMaterial, MeshFile, NodeTable, Numbering
 from mpitled.readers.text import Block, KeywordLine, decode, where
@@ -187,7 +187,7 @@ class _Reader:
         self.nodes = NodeTable()
         self.fixed: list[tuple[Ints, int, str]] = []  # nodes, code TC, origin
         self.solids: list[tuple[Ints, Ints, str]] = []  # rows (n, 10), parts (n,), origin
-        self.others: list[tuple[str, Ints, str]] = []  # keyword, rows, origin
+        self.other_elements: list[tuple[str, Ints, str]] = []  # keyword, rows, origin
         self.sets: dict[str, dict[int, _Set]] = {"node": {}, "cell": {}, "part": {}}
         self.parts: dict[int, tuple[str, int]] = {}  # title and material
         self.materials: dict[int, FileMaterial] = {}
@@ -240,7 +240,7 @@ class _Reader:
             fields.pop()
         return _Card(fields, origin, self.parameters)
 
-    def _rows(self, keyword: _Keyword, widths: list[list[int]], dtype: type[int] | type[float]) -> NDArray[np.float64]:
+    def _rows(self, keyword: _Keyword, widths: list[list[int]], dtype: type[int] | type[float]) -> Floats:
         """Numbers (n_rows, n_fields) of all lines; a row has a line for each list of widths, and blanks are 0."""
         parts = [np.empty((0, sum(map(len, widths))), dtype)]
         pending: list[_Card] = []
@@ -306,13 +306,13 @@ class _Reader:
             except InputError:
                 continue
         if rows:
-            self.others.append((keyword.name, np.array(rows).clip(-1, meshfile.MAX_ID + 1), keyword.origin))
+            self.other_elements.append((keyword.name, np.array(rows).clip(-1, meshfile.MAX_ID + 1), keyword.origin))
 
     def _set(self, keyword: _Keyword) -> None:
         name, _ = keyword.without("TITLE", "COLLECT")
         kind = {"NODE": "node", "SOLI": "cell", "PART": "part"}[name[4:8]]
         set_option = name.split("_", 2)[2].removeprefix("LIST_") if name.count("_") > 1 else "LIST"
-        general = set_option == "GENERAL"  # each card has its own option in the first field
+        general = set_option == "GENERAL"  # each card has an option in the first field
         title, lines = keyword.split_title()
         card = self._card(keyword, *lines[0])
         number = card.integer(0)
@@ -447,7 +447,7 @@ class _Reader:
         self.solids.clear()
         meshfile.check_unique_cells(mesh.cells)
         part_of = meshfile.joined(parts)
-        for name, rows, origin in self.others:
+        for name, rows, origin in self.other_elements:
             nodes, exists = self.numbering["node"].rows(rows[:, 2:])
             members = mesh.n_cells + np.arange(len(rows))
             mesh.cells.append(Cells("other", name, rows[:, 0], np.where(exists, nodes, -1), origin))

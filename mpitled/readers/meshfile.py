@@ -1,4 +1,4 @@
-"""The contents of a mesh file in its own numbers and units: nodes, elements, sets, constraints and materials."""
+"""The contents of a mesh file in the file's numbers and units: nodes, elements, sets, constraints and materials."""
 
 from __future__ import annotations
 
@@ -122,16 +122,16 @@ class Numbering:
         """Rows of the numbers `labels`, and a mask of existing numbers; the row of a missing number is arbitrary."""
         if len(self.ids) == 0:
             return np.zeros(labels.shape, np.int64), np.zeros(labels.shape, bool)
-        place = labels - self.ids[0] if self._dense else np.searchsorted(self.ids, labels)
-        place = np.clip(place, 0, len(self.ids) - 1)
-        found = self.ids[place] == labels
-        return (place if self.order is None else self.order[place]), found
+        index = labels - self.ids[0] if self._dense else np.searchsorted(self.ids, labels)
+        index = np.clip(index, 0, len(self.ids) - 1)
+        exists = self.ids[index] == labels
+        return (index if self.order is None else self.order[index]), exists
 
     def between(self, first: int, last: int, step: int) -> Ints:
         """Rows of the existing numbers among first, first + step, ..., last."""
         start, stop = np.searchsorted(self.ids, [first, last + 1])
-        place = start + np.flatnonzero((self.ids[start:stop] - first) % step == 0)
-        return place if self.order is None else self.order[place]
+        index = start + np.flatnonzero((self.ids[start:stop] - first) % step == 0)
+        return index if self.order is None else self.order[index]
 
     def members(self, labels: Ints, kind: str, name: str, origin: str, remarks: list[str]) -> Ints:
         """Rows of a set's members; missing members are ignored with a warning in `remarks`."""

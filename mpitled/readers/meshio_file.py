@@ -53,10 +53,10 @@ def _check_hdf5(path: Path) -> None:
     elif path.suffix.lower() in (".xdmf", ".xmf"):
         text = decode(read_text(path, "a mesh (XDMF)"))
         for name in sorted(set(re.findall(r"([^<>\s]+):/", text))):
-            beside = path.parent / name
-            if Path(name).name != name or not beside.is_file():
+            data = path.parent / name
+            if Path(name).name != name or not data.is_file():
                 raise InputError(f"{path}: its data are in {name}, which is not beside it; put it there")
-            check_hdf5(beside)
+            check_hdf5(data)
 
 
 def _converted(mesh: Any, path: Path) -> MeshFile:
