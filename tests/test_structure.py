@@ -18,7 +18,7 @@ from mpitled.results import figures
 
 PACKAGES = ("mpitled", "partition")
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
-#: The folders and top modules of `mpitled`. Each imports only those before it.
+#: The folders and top modules of `mpitled`. Each imports only earlier names of this list.
 ORDER = [
     "errors", "atomic", "lock", "checksum", "resources", "hdf5_validation", "hdf5", "toml",
     "laws", "mesh", "kernels", "cells", "deck", "meshing", "readers", "model", "store", "parallel", "terms", "solver",
