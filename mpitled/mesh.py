@@ -40,11 +40,11 @@ class Constraint:
 
     node_set: str
     directions: tuple[int, ...]  # of 0, 1, 2
-    #: m at full load, one for each direction, 0 where fixed; an array (n_nodes,) where the set's nodes differ
+    #: m at full load, one for each direction, 0 if fixed; an array (n_nodes,) if the nodes have different values
     displacement: tuple[float | Floats, ...]
     origin: str = ""  # file and line or key, for messages
-    rotation: Rotation | None = None  # added to the displacement
-    field: Path | None = None  # added to both: a table of displacements, see `model.mapping`
+    rotation: Rotation | None = None  # its displacement is added
+    field: Path | None = None  # a table of displacements to be added, see `model.mapping`
     field_metre: float = 1.0  # the table's unit of length, m
 
 
@@ -54,8 +54,8 @@ class Part:
 
     spheres: tuple[str, ...]  # names of the spheres around it
     integration_points: Ints  # ascending
-    nodes: Ints  # in it and on its surface, ascending
-    areas: Floats  # (nodes, 3), m^2: integral of N_a n over its surface but the seed's; 0 in a single part
+    nodes: Ints  # inside and on the surface, ascending
+    areas: Floats  # (n_nodes, 3), m^2: integral of N_a n over the surface without the seed; 0 in a single part
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class Mesh:
     integration_volumes: Floats  # (n_integration,), m^3
     node_sets: dict[str, Ints]  # name -> ascending nodes
     cell_sets: dict[str, Ints]  # name -> ascending cells
-    node_ids: Ints  # (n_nodes,), numbers in the nodes' file
+    node_ids: Ints  # (n_nodes,), numbers in the input file
     # (n_nodes, 3), m^2: integral of N_a n over the outer surface at nodes on the cloud's boundary; None if unknown.
     surface_areas: Floats | None = None
     parts: tuple[Part, ...] = ()  # of the cloud, if known
@@ -91,9 +91,9 @@ class Mesh:
 
 
 def check_size(n_hexahedra: float, key: str, remedy: str = "ask for fewer") -> None:
-    """InputError if the hexahedra that a key of the deck asks for exceed the machine's memory."""
-    what = f"{key}: makes {n_hexahedra:.3g} hexahedra, which"
-    resources.check_memory(_HEXAHEDRON_BYTES * n_hexahedra, what, remedy)
+    """InputError if the number of hexahedra that a key of the deck requests exceeds the machine's memory."""
+    request = f"{key}: makes {n_hexahedra:.3g} hexahedra, which"
+    resources.check_memory(_HEXAHEDRON_BYTES * n_hexahedra, request, remedy)
 
 
 def hexahedral_mesh(points: Floats, hexahedra: Ints, node_sets: dict[str, Ints]) -> Mesh:
@@ -112,7 +112,7 @@ def numbered_mesh(
     surface_areas: Floats | None = None,
     parts: tuple[Part, ...] = (),
 ) -> Mesh:
-    """A mesh without a file: node numbers start at 1, and the cell sets are all, hexahedra and cloud."""
+    """A generated mesh: node numbers start at 1, and the cell sets are "all", "hexahedra" and "cloud"."""
     cells = np.arange(len(hexahedra) + len(integration_points))
     return Mesh(
         points=points,
@@ -130,7 +130,7 @@ def numbered_mesh(
 
 
 def structured_hexahedra(shape: tuple[int, int, int]) -> Ints:
-    """Hexahedra (n, 8) of a grid of (nx, ny, nz) cells whose nodes are numbered along x, then y, then z."""
+    """Hexahedra (n, 8) of a grid of (nx, ny, nz) cells; nodes are numbered along x, then y, then z."""
     nx, ny, nz = shape
     lines = np.array([1, nx + 1, (nx + 1) * (ny + 1)])
     k, j, i = np.meshgrid(np.arange(nz), np.arange(ny), np.arange(nx), indexing="ij")
@@ -146,7 +146,7 @@ def grid_points(shape: tuple[int, int, int], size: tuple[float, float, float]) -
 
 
 def named_set(sets: dict[str, Ints], name: str, origin: str) -> Ints:
-    """The set with that name; InputError with the known names if it is missing or empty."""
+    """The set with that name; InputError if it is missing or empty."""
     if name not in sets:
         near = difflib.get_close_matches(name, sets, 1)
         hint = f"did you mean '{near[0]}'? Sets: " if near else "sets: "

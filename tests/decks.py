@@ -1,4 +1,4 @@
-"""Small decks of every kind that is read, written for the tests: one mesh, and oddities of programs around it."""
+"""Small decks for the tests, in every supported format."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ two cubes
 *END STEP
 """
 
-#: The same as a part that is there twice, once moved and turned.
+#: A cube as a part with two instances, one translated and rotated.
 ASSEMBLY = """*Heading
 ** Job name: Job-1 Model name: Model-1
 *Preprint, echo=NO, model=NO, history=NO, contact=NO
@@ -130,7 +130,7 @@ CLOUD = """*NODE
  6, 1, 6, 2, 7
 """
 
-#: What FLAT includes when it is cut in two.
+#: FLAT as two files: the second is included.
 INCLUDING = "*INCLUDE, INPUT=mesh/nodes.inp\n" + FLAT[FLAT.index("*ELEMENT") :]
 INCLUDED = FLAT[: FLAT.index("*ELEMENT")]
 
@@ -189,7 +189,7 @@ right
 *END
 """
 
-#: The same with commas.
+#: DYNA with commas.
 DYNA_COMMAS = re.sub(r"(?m)^(?: +(?:[\d.e+-]+|&\w+))+$", lambda line: ",".join(line[0].split()), DYNA)
 DYNA_COMMAS = DYNA_COMMAS.replace("R    young      3e-3R     pois      0.49", "R    young,3e-3,R     pois,0.49")
 
@@ -199,7 +199,7 @@ def numbers(rows: NDArray[np.generic]) -> str:
 
 
 def void_decks() -> dict[str, str]:
-    """A block of 5 x 5 x 5 hexahedra of 1 mm without the 3 x 3 x 3 in the middle, the cloud in there, and its grid."""
+    """A block of 5 x 5 x 5 hexahedra of 1 mm without the middle 3 x 3 x 3, a cloud in this void, and its grid."""
     shape, middle = (5, 5, 5), (3, 3, 3)
     points, cells = grid_points(shape, (5.0, 5.0, 5.0)), structured_hexahedra(shape)
     centre = points[cells].mean(axis=1)
@@ -233,7 +233,7 @@ displacement = [0.0]
     return {"fe.inp": fe, "efg.inp": efg, "grid.csv": grid, "scene.toml": scene}
 
 
-#: Every kind: its files, the first of which is checked.
+#: Files of each kind; the first file is the one that is read.
 KINDS: dict[str, dict[str, str]] = {
     "flat": {"deck.inp": FLAT},
     "assembly": {"deck.inp": ASSEMBLY},

@@ -1,9 +1,9 @@
-"""Fuzz every reader: `python tests/fuzz.py` breaks whole files at random and prints how their reading ended.
+"""Fuzz every reader: `python tests/fuzz.py` changes valid files at random, reads them and prints a table.
 
-A table says for each reader how many inputs were tried, how many of them ended in a result and how many in one line of
-an InputError, how many ended otherwise (crashes) or not within 15 s (hangs), and the largest memory. Exit status 1 if
-there was a crash or a hang. Readers work in processes of their own, which may take 1 GiB. `--engine hypothesis` lets
-hypothesis choose what is broken, `--engine atheris` the coverage of the program (pip install atheris).
+The table has, for each reader, the number of inputs, results, one-line errors, crashes (other exceptions) and hangs
+(more than 15 s), and the largest memory. Exit status 1 after a crash or a hang. Each reader works in a separate process
+with at most 1 GiB. The engine "hypothesis" chooses the changes by hypothesis, "atheris" by the coverage of the program
+(pip install atheris).
 """
 
 from __future__ import annotations
@@ -33,38 +33,37 @@ if TYPE_CHECKING:
 
 ENGINES = ("random", "hypothesis", "atheris")
 LONGEST_S, MOST_BYTES = 15, 1 << 30
-#: Inputs of slow readers, as a share of those of the others.
+#: Number of inputs of slow readers over the number of other readers.
 SHARES = {"deck, with the time it takes": 0.1, "decks of a mixed mesh": 0.2, "model.h5": 0.5, "result.vtkhdf": 0.5}
 
 
-# --- in a process of its own ---------------------------------------------------------------------------------------
+# --- the worker process --------------------------------------------------------------------------------------------
 
 
 def work(reader: Reader, engine: str, first: int, count: int, report: int, folder: Path) -> None:
-    """Try inputs number `first` and on; says of each to the descriptor `report` that it begins, and how it ended."""
-
+    """Try inputs from number `first` on, and write the begin and the end of each to the descriptor `report`."""
     from hostile import attempt
 
-    def tell(word: str) -> None:
+    def write(word: str) -> None:
         os.write(report, word.encode() + b"\n")
 
     def one(rng: random.Random, name: object) -> None:
-        tell(f"begin {name}")
-        signal.setitimer(signal.ITIMER_PROF, LONGEST_S)  # of computing: others may use the machine too
+        write(f"begin {name}")
+        signal.setitimer(signal.ITIMER_PROF, LONGEST_S)  # CPU time: other processes may use the machine
         try:
-            tell(attempt(reader, folder, rng))
+            write(attempt(reader, folder, rng))
         except TimeoutError:
-            tell("hang")
+            write("hang")
             traceback.print_exc()
         except (Exception, SystemExit):
-            tell("crash")
+            write("crash")
             traceback.print_exc()
-        except BaseException:  # of hypothesis, which wants no more of this input
-            tell("over")
+        except BaseException:  # hypothesis ends an input in this way
+            write("over")
             raise
         finally:
             signal.setitimer(signal.ITIMER_PROF, 0)
-        tell(f"memory {_peak()}")
+        write(f"memory {_peak()}")
 
     numbers = iter(range(first, first + count))
     if engine == "random":
@@ -88,7 +87,7 @@ def work(reader: Reader, engine: str, first: int, count: int, report: int, folde
         import atheris
 
         class Directed(random.Random):
-            """Takes its bits from the bytes that atheris found worth while, and zeros when they are used up."""
+            """Random bits from the bytes of atheris, then zeros."""
 
             def __init__(self, data: bytes) -> None:
                 self._data = atheris.FuzzedDataProvider(data)
@@ -99,20 +98,14 @@ def work(reader: Reader, engine: str, first: int, count: int, report: int, folde
             def getrandbits(self, k: int) -> int:
                 return int.from_bytes(self._data.ConsumeBytes(-(-k // 8)), "little") & ((1 << k) - 1)
 
-        arguments = [
-            sys.argv[0],
-            f"-runs={count}",
-            f"-seed={first + 1}",
-            "-max_len=512",
-            "-rss_limit_mb=0",
-            "-verbosity=0",
-        ]
+        limits = ["-max_len=512", "-rss_limit_mb=0", "-verbosity=0"]
+        arguments = [sys.argv[0], f"-runs={count}", f"-seed={first + 1}", *limits]
         atheris.Setup(arguments, lambda data: one(Directed(data), next(numbers, "last")))
         atheris.Fuzz()
 
 
 def _instrumented(engine: str) -> contextlib.AbstractContextManager[object]:
-    """Imports that tell atheris where the program goes."""
+    """Imports with coverage instrumentation for atheris."""
     if engine != "atheris":
         return contextlib.nullcontext()
     import atheris
@@ -126,7 +119,7 @@ def _too_long(*_: object) -> None:
 
 def _worker(name: str, engine: str, first: int, count: int, scratch: Path) -> None:
     report = os.dup(1)
-    os.dup2(2, 1)  # what libraries print is for the log
+    os.dup2(2, 1)  # output of libraries goes to the log
     faulthandler.enable()
     with _instrumented(engine):
         from hostile import readers
@@ -139,7 +132,7 @@ def _worker(name: str, engine: str, first: int, count: int, scratch: Path) -> No
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 30, 1 << 30))
     with tempfile.TemporaryDirectory() as folder:
         with contextlib.suppress(FileNotFoundError):
-            Path("/proc/self/clear_refs").write_text("5")  # the largest memory from here on
+            Path("/proc/self/clear_refs").write_text("5")  # resets the peak memory
         work(reader, engine, first, count, report, Path(folder))
 
 
@@ -152,14 +145,14 @@ def _peak() -> int:
 
 
 def fuzz(name: str, count: int, engine: str, first: int, scratch: Path, log: Path) -> Counter[str]:
-    """How many inputs of a reader ended how, "memory" in bytes; a process that dies is followed by another."""
+    """Counts of the ends of a reader's inputs, and "memory" in bytes; a dead worker is replaced."""
     ends: Counter[str] = Counter()
-    with log.open("ab") as said:
+    with log.open("ab") as errors:
         while ends["tried"] < count:
             begun = first + ends["tried"]
             words = [sys.executable, __file__, "--worker", name, "--engine", engine, "--scratch", str(scratch)]
             words += ["--first", str(begun), "--count", str(count - ends["tried"])]
-            process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=said, stdin=subprocess.DEVNULL)
+            process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=errors, stdin=subprocess.DEVNULL)
             before, died = ends["tried"], _follow(process, ends)
             if died and ends["tried"] == before:
                 raise RuntimeError(f"{name}: its process ended with {process.returncode} before any input; see {log}")
@@ -169,13 +162,13 @@ def fuzz(name: str, count: int, engine: str, first: int, scratch: Path, log: Pat
 
 
 def _follow(process: subprocess.Popen[bytes], ends: Counter[str]) -> bool:
-    """Count what a worker says; whether it died of an input, which is counted as a crash or a hang."""
+    """Count the reports of a worker. True if the worker died, which counts as a crash or a hang."""
     assert process.stdout is not None
     at_work = False
     with process, selectors.DefaultSelector() as selector:
         selector.register(process.stdout, selectors.EVENT_READ)
         while True:
-            # The timer inside comes first where it can: it counts the time of computing alone.
+            # The worker's timer, which counts CPU time only, normally comes first.
             if not selector.select(8 * LONGEST_S):
                 process.kill()
                 ends["hang"] += 1
@@ -195,11 +188,8 @@ def _follow(process: subprocess.Popen[bytes], ends: Counter[str]) -> bool:
 
 
 def table(rows: dict[str, Counter[str]]) -> str:
-    """Markdown, a line for each reader."""
-    lines = [
-        "| reader | inputs | result | one line | crashes | hangs | largest memory |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    """A Markdown table with a line for each reader."""
+    lines = ["| reader | inputs | result | one line | crashes | hangs | largest memory |", "|" + 7 * "---|"]
     for name, ends in rows.items():
         counts = [ends[end] for end in ("tried", "result", "error", "crash", "hang")]
         memory = f"{ends['memory'] / 2**20:.0f} MiB" if ends["memory"] else "-"
@@ -213,7 +203,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--engine", choices=ENGINES, default="random")
     parser.add_argument("--first", type=int, default=0, help="number of the first input (0)")
     parser.add_argument("--only", default="", help="readers whose names contain this")
-    parser.add_argument("--log", type=Path, default=Path("fuzz.log"), help="what went wrong (%(default)s)")
+    parser.add_argument("--log", type=Path, default=Path("fuzz.log"), help="log of errors (%(default)s)")
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     parser.add_argument("--scratch", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--count", type=int, dest="of_worker", help=argparse.SUPPRESS)

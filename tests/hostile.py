@@ -1,4 +1,4 @@
-"""Files as an attacker would send them: whole ones of every kind that is read, how they are broken, their readers."""
+"""Hostile input: valid files of every format, random changes of these files, and their readers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _NASTY = [
     "-5", "0", "2147483648", "9" * 400, "1.5", '"', ",", "*", "**", "$", "&x", "\t", "\x00", "é", "  ", "1 2", "+",
     "1000000000000", "../../../tmp/out", "/dev/zero", "true", "[]", "[[[[", "{}", "1e-300",
 ]  # fmt: skip
-#: For the values of a deck: the syntax stays right.
+#: Values of a deck in valid syntax.
 _VALUES = [
     "0", "-1", "1", "2", "100000", "2147483647", "1e-300", "1e-9", "1e-3", "0.5", "1.0", "1e6", "1e15", "1e300", "inf",
     "nan", "true", '""', '"x"', '"../../x"', '"x0"', '"all"', '"core"', '"none"', '"dynamic"', "[]", "[1]", "[[1]]",
@@ -39,17 +39,16 @@ _WORDS = [0, 1, 2**31 - 1, 2**31, 2**32 - 1, 10**12, 2**63 - 1, 2**63, 2**64 - 1
 
 @dataclass(frozen=True, slots=True)
 class Reader:
-    """One way into the program: whole inputs, each a set of files of which the first is read, and what reads it."""
+    """A reader and valid inputs; an input is a set of files, and the reader gets the first of them."""
 
     read: Callable[[Path], object]
     inputs: Mapping[str, Mapping[str, bytes]]
-    #: By the end of a name: from the file to what is broken in it, and back. Compressed data would hide all behind a
-    #: checksum.
+    #: Suffix of a file -> functions that unpack the file before the change and pack it afterwards.
     inside: Mapping[str, tuple[Callable[[bytes], bytes], Callable[[bytes], bytes]]] = field(default_factory=dict)
 
 
 def attempt(reader: Reader, folder: Path, rng: random.Random) -> str:
-    """Break one input and have it read: "result" or "error"; whatever else comes is a fault of the program."""
+    """Change one input and read it. Returns "result" or "error" (a one-line InputError); raises for a fault."""
     files = reader.inputs[rng.choice(list(reader.inputs))]
     victim = rng.choice(list(files))
     written = set()
@@ -74,7 +73,7 @@ def attempt(reader: Reader, folder: Path, rng: random.Random) -> str:
 
 
 def broken(reader: Reader, name: str, data: bytes, rng: random.Random) -> bytes:
-    """The file with one to six changes, inside of what holds it."""
+    """The file with one to six changes of its unpacked content."""
     if name.endswith((".h5", ".vtkhdf")) and rng.random() < 0.6:
         return _broken_hdf5(data, rng)
     if name.endswith(".toml") and rng.random() < 0.7:
@@ -89,7 +88,7 @@ def broken(reader: Reader, name: str, data: bytes, rng: random.Random) -> bytes:
 
 
 def _broken_deck(data: bytes, rng: random.Random) -> bytes:
-    """One to four values changed, or a key of another place of the deck brought in."""
+    """One to four changed values, or inserted keys of another section."""
     lines = data.decode().split("\n")
     for _ in range(rng.choice([1, 1, 2, 4])):
         at = rng.choice([i for i, line in enumerate(lines) if " = " in line])
@@ -107,7 +106,7 @@ def _is_text(data: bytes) -> bool:
 
 
 def _text_change(data: bytes, rng: random.Random) -> bytes:
-    """Bytes dropped or changed, lines swapped, dropped or doubled, numbers broken, the end cut off."""
+    """Removed or changed bytes, swapped, removed or repeated lines, invalid numbers, or a missing end."""
     lines = data.split(b"\n")
     kind = rng.randrange(10)
     at = rng.randrange(len(data)) if data else 0
@@ -135,7 +134,7 @@ def _text_change(data: bytes, rng: random.Random) -> bytes:
 
 
 def _binary_change(data: bytes, rng: random.Random) -> bytes:
-    """Bytes, or whole words of two to eight, changed; pieces dropped, doubled or cut off. The head is hit most."""
+    """Changed bytes or words of two to eight bytes, removed or repeated pieces, or a missing end; often in the head."""
     end = len(data) if rng.random() < 0.5 else min(len(data), 2048)
     at, kind = rng.randrange(max(end, 1)), rng.randrange(7)
     if kind == 0:
@@ -153,7 +152,7 @@ def _binary_change(data: bytes, rng: random.Random) -> bytes:
 
 
 def _broken_hdf5(data: bytes, rng: random.Random) -> bytes:
-    """A file that HDF5 finds in order, with other contents: values, shapes, types, links, claims, attributes."""
+    """A valid HDF5 file with changed values, shapes, types, links, claimed sizes or attributes."""
     image = io.BytesIO(data)
     with h5py.File(image, "r+") as file:
         names: list[str] = []
@@ -186,7 +185,7 @@ def _broken_hdf5(data: bytes, rng: random.Random) -> bytes:
             file[name] = rng.choice(
                 [h5py.SoftLink("/points"), h5py.ExternalLink("/etc/passwd", "/x"), h5py.SoftLink(name)]
             )
-        elif kind == 7:  # a claim that nothing stands behind
+        elif kind == 7:  # a claimed size without data
             del file[name]
             chunks = rng.choice([None, (1 << 20,)])
             packed = {"compression": "gzip"} if chunks and rng.random() < 0.5 else {}
@@ -212,11 +211,11 @@ def _broken_hdf5(data: bytes, rng: random.Random) -> bytes:
     return image.getvalue()
 
 
-# --- what is read --------------------------------------------------------------------------------------------------
+# --- readers --------------------------------------------------------------------------------------------------------
 
 
 def _rezip(change: Callable[[bytes], bytes]) -> tuple[Callable[[bytes], bytes], Callable[[bytes], bytes]]:
-    """Break the largest member of a .npz, and make its checksums right again."""
+    """Change the largest member of a .npz, with correct checksums."""
     kept: dict[str, bytes] = {}
 
     def opened(data: bytes) -> bytes:
@@ -253,7 +252,7 @@ _HEAD = '[labels]\nimage = "head.nii.gz"\nelement_size = 4.0\n[[fixed]]\nnodes =
 
 
 def readers(scratch: Path) -> dict[str, Reader]:
-    """Every reader by name; `scratch` is a folder for what has to be computed first."""
+    """All readers by name; `scratch` is a folder for computed inputs."""
     from mpitled.batch import cases, vary
     from mpitled.preview import overview
 
@@ -266,7 +265,11 @@ def readers(scratch: Path) -> dict[str, Reader]:
     run, model, result, kept = _run(scratch)
     unpack = {".gz": (gzip.decompress, gzip.compress), ".npz": _rezip(bytes)}
     planned = cases.plan(
-        scratch / "run.toml", [{"solver.load_time": "1.0"}], ["output.pictures=false"], 1, scratch / "sweep"
+        scratch / "run.toml",
+        [vary.Values({"solver.load_time": "1.0"})],
+        ["output.pictures=false"],
+        1,
+        scratch / "sweep",
     )
     planned.write_manifest()
     sweep = (scratch / "sweep" / cases.MANIFEST).read_bytes()
@@ -330,7 +333,7 @@ def _reference(run: Path) -> Callable[[Path], object]:
 
 
 def _model(path: Path) -> object:
-    """All that is read of a model, and the arrays that a rank makes of it, with each kernel called once."""
+    """Read a model completely, make the arrays of a rank, and call each kernel once."""
     from mpitled import info, store
     from mpitled.deck import Solver
     from mpitled.parallel.halo import World
@@ -370,11 +373,11 @@ def _result(path: Path) -> object:
     return field.open_field(path)
 
 
-# --- whole files ---------------------------------------------------------------------------------------------------
+# --- valid files ---------------------------------------------------------------------------------------------------
 
 
 def _run(scratch: Path) -> tuple[Path, bytes, bytes, bytes]:
-    """A small run's folder, its model (partitioned in two), its result, and a checkpoint."""
+    """The folder of a small run, and its model (with a partition for two ranks), result and checkpoint."""
     from mpitled import job, store
     from mpitled.deck import load_deck
     from mpitled.parallel.halo import World
@@ -385,15 +388,15 @@ def _run(scratch: Path) -> tuple[Path, bytes, bytes, bytes]:
         job.run(load_deck(deck, ("output.pictures=false", "solver.load_time=0.05")), folder, World(), quiet=True)
         job.ensure_partition(folder / job.MODEL, 2, 0)
         rows = store.read_part(folder / job.MODEL, 1, 0)
-        told = {"version": "0", "ranks": 1, "step": 3, "share": 0.1, "frames": 1}
-        store.write_checkpoint(scratch, None, rows, told, {"u": np.zeros((rows.n_nodes, 3))}, [0.5, 1.0])
+        record = {"version": "0", "ranks": 1, "step": 3, "share": 0.1, "frames": 1}
+        store.write_checkpoint(scratch, None, rows, record, {"u": np.zeros((rows.n_nodes, 3))}, [0.5, 1.0])
     files = (folder / job.MODEL, folder / "result.vtkhdf", scratch / store.CHECKPOINTS[0])
     model, result, kept = (path.read_bytes() for path in files)
     return folder, model, result, kept
 
 
 def _cubes() -> Any:
-    """Two hexahedra with sets, as meshio has them."""
+    """Two hexahedra with sets, as a mesh of meshio."""
     import meshio
 
     points = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1, 2)], float)
@@ -415,7 +418,7 @@ def _meshio_files(scratch: Path) -> dict[str, dict[str, bytes]]:
         folder.mkdir(exist_ok=True)
         try:
             _cubes().write(folder / name, **options)
-        except ImportError:  # of a package that a format wants
+        except ImportError:  # an optional package of the format is missing
             continue
         files = {name: (folder / name).read_bytes()}
         found[name] = files | {path.name: path.read_bytes() for path in folder.iterdir() if path.name != name}

@@ -1,4 +1,4 @@
-"""Abaqus decks: one oddity a test, the same mesh however it is written, true errors, and what must not be allocated."""
+"""Abaqus decks: equal content in every notation, features of the format, and errors with file and line."""
 
 from __future__ import annotations
 
@@ -30,18 +30,17 @@ def ids_of(file: MeshFile, name: str) -> list[int]:
 
 
 def assert_same(one: MeshFile, other: MeshFile) -> None:
-    """The same model to the bit, whatever the file is called."""
+    """The models of both files are bit-identical."""
     assert one.points.tobytes() == other.points.tobytes()
     np.testing.assert_array_equal(one.node_ids, other.node_ids)
     nodes = [np.concatenate([block.nodes for block in file.cells]) for file in (one, other)]
     np.testing.assert_array_equal(*nodes)
     np.testing.assert_array_equal(*(np.concatenate([block.ids for block in file.cells]) for file in (one, other)))
     for kind in ("node_sets", "cell_sets"):
-        mine, others = getattr(one, kind), getattr(other, kind)
-        assert {name.casefold() for name in mine} == {name.casefold() for name in others}
-        by_name = {name.casefold(): members for name, members in others.items()}
+        mine, theirs = ({name.casefold(): rows for name, rows in getattr(f, kind).items()} for f in (one, other))
+        assert mine.keys() == theirs.keys()
         for name, members in mine.items():
-            np.testing.assert_array_equal(members, by_name[name.casefold()])
+            np.testing.assert_array_equal(members, theirs[name])
     constraints = [
         sorted((c.node_set.casefold(), c.directions, c.displacement) for c in file.constraints) for file in (one, other)
     ]
@@ -50,7 +49,7 @@ def assert_same(one: MeshFile, other: MeshFile) -> None:
     assert laws[0] == laws[1]
 
 
-def test_a_flat_deck_is_read_whole(tmp_path):
+def test_a_flat_deck_is_read_completely(tmp_path):
     file = read(tmp_path, FLAT)
     np.testing.assert_array_equal(file.node_ids[:3], [10, 20, 30])  # the file's order and numbers
     (block,) = file.cells
@@ -69,8 +68,8 @@ def test_a_flat_deck_is_read_whole(tmp_path):
     assert file.remarks == []
 
 
-def test_what_is_skipped_is_listed_if_it_may_matter(tmp_path):
-    """Titles and requests for output are in every deck; those of contacts are no contacts."""
+def test_skipped_keywords_are_listed(tmp_path):
+    """Except titles and requests for output; *CONTACT OUTPUT is no contact."""
     output = "*OUTPUT, FIELD\n*NODE OUTPUT\n U,\n*CONTACT OUTPUT\n CSTRESS,\n*RESTART, WRITE\n*END STEP"
     file = read(tmp_path, FLAT.replace("*STATIC", "*VISCO").replace("*END STEP", output))
     assert file.remarks == [f"{tmp_path / 'deck.inp'}: skipped, because the results do not depend on it: *VISCO"]
@@ -78,7 +77,7 @@ def test_what_is_skipped_is_listed_if_it_may_matter(tmp_path):
 
 
 def test_a_deck_that_is_cut_short_is_recognised(tmp_path):
-    """Within a part all nodes belong to it; without an instance none of them is in the model."""
+    """Nodes of a part without an instance are not in the model."""
     cut = ASSEMBLY[: ASSEMBLY.index("*Elset, elset=Set-1")]
     with pytest.raises(InputError, match=r"Cube, .* has no \*INSTANCE; the file ends within \*PART Cube: is it cut"):
         read(tmp_path, cut)
@@ -117,16 +116,16 @@ WRITTEN = {
 
 
 @pytest.mark.parametrize("how", WRITTEN)
-def test_the_same_content_written_otherwise_is_the_same(tmp_path, how):
+def test_every_notation_gives_the_same_model(tmp_path, how):
     assert_same(read(tmp_path, FLAT), read(tmp_path, WRITTEN[how], "other.inp"))
 
 
-def test_instances_are_moved_turned_and_told_apart(tmp_path):
+def test_instances_are_translated_rotated_and_named(tmp_path):
     file = read(tmp_path, ASSEMBLY)
     assert len(file.points) == 16
     np.testing.assert_array_equal(file.node_ids, [*range(1, 9)] * 2)
     first, second = file.points[:8], file.points[8:]
-    # Moved by 10 along x, then turned by 90 degrees about the line x = 10, y = 0.
+    # Translated by 10 along x, then rotated by 90 degrees about the line x = 10, y = 0.
     expected = np.stack([10 - first[:, 1], first[:, 0], first[:, 2]], axis=1)
     np.testing.assert_allclose(second, expected, atol=1e-15 * 10)
     assert file.node_sets["both bases"].tolist() == [0, 1, 2, 3, 8, 9, 10, 11]
@@ -167,7 +166,7 @@ def test_sets_of_sets_in_any_order_and_ranges(tmp_path):
 
 
 def test_faces_of_all_solids_are_their_surface(tmp_path):
-    """S1 to S6 together are what only one element has; each face of the cube is in one plane."""
+    """Each face S1 to S6 of a cube lies in another plane; without a face name all exterior faces count."""
     cube = FLAT.replace(" 3, 20, 30, 35, 25, 120, 130, 135, 125\n", "")
     planes = set()
     for face in range(1, 7):
@@ -207,7 +206,7 @@ def test_coordinates_in_other_systems(tmp_path):
     np.testing.assert_allclose(points, [[0, 2, 3], [0, 0, 2]], atol=1e-15)
 
 
-def test_later_steps_take_nodes_over(tmp_path):
+def test_later_steps_replace_conditions_of_earlier_steps(tmp_path):
     more = "*STEP\n*BOUNDARY\n 30, 1, 1, 0.5\n left, 1, 1, -0.5\n*END STEP\n"
     file = read(tmp_path, FLAT + more)
     at: dict[tuple[int, int], set[float]] = {}
@@ -234,7 +233,7 @@ def test_nodes_one_by_one_are_one_constraint(tmp_path):
     np.testing.assert_array_equal(values, 0.01 * file.node_ids[file.node_sets[moved.node_set]])
 
 
-# ------------------------------------------------------------ what is not computed
+# ------------------------------------------------------------ unsupported content
 
 
 @pytest.mark.parametrize(
@@ -255,7 +254,7 @@ def test_nodes_one_by_one_are_one_constraint(tmp_path):
         (FLAT[len(INCLUDED) :], "*ELEMENT, TYPE=CPS4R\n 1, 10, 20, 25, 15\n", "its elements are CPS4R (line 17)"),
     ],
 )
-def test_what_changes_the_mechanics_is_refused_by_name_and_line(tmp_path, old, new, words):
+def test_unsupported_mechanics_are_refused_with_name_and_line(tmp_path, old, new, words):
     path = tmp_path / "deck.inp"
     path.write_text(FLAT.replace(old, new, 1))
     with pytest.raises(InputError) as caught:
@@ -271,7 +270,7 @@ def test_faces_that_gmsh_writes_as_elements_are_node_sets(tmp_path):
     assert any("CPS4" in remark and "left out" in remark for remark in mesh.remarks)
 
 
-def test_other_laws_are_named_and_left_to_the_deck(tmp_path):
+def test_unsupported_laws_are_remarked(tmp_path):
     file = read(tmp_path, FLAT.replace("*ELASTIC", "*PLASTIC\n 1., 0.\n*ELASTIC"))
     assert file.materials == []
     assert any("brain has *PLASTIC" in remark and "solid" in remark for remark in file.remarks)
@@ -311,9 +310,9 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("what", WRONG)
-def test_errors_name_file_line_and_culprit(tmp_path, what):
-    text, words = WRONG[what]
+@pytest.mark.parametrize("case", WRONG)
+def test_errors_name_file_and_cause(tmp_path, case):
+    text, words = WRONG[case]
     with pytest.raises(InputError) as caught:
         read(tmp_path, text)
     message = str(caught.value)
@@ -332,12 +331,12 @@ def test_repeated_nodes_at_one_place_and_unknown_members_are_remarked(tmp_path):
     assert any("set left has 2 nodes that are not there, the first 16" in remark for remark in file.remarks)
 
 
-# ------------------------------------------------------------ the same content in random dress
+# ------------------------------------------------------------ random meshes in random notation
 
 
 @st.composite
 def formats(draw):
-    """How a deck is written: letters, ends of lines, separators, comments, floats, rows a line."""
+    """Notation of a deck: case, line ends, separators, comments, floats, fields in a line, blocks."""
     return {
         "case": draw(st.sampled_from([str.upper, str.lower, str.title, str])),
         "end": draw(st.sampled_from(["\n", "\r\n", " \n", "\n\n", "\n** 1, 2, 3\n"])),
@@ -354,7 +353,7 @@ def formats(draw):
 @given(
     shape=st.tuples(*[st.integers(1, 3)] * 3), seed=st.integers(0, 2**32 - 1), how=formats(), step=st.integers(1, 1000)
 )
-def test_random_meshes_in_random_dress(tmp_path, shape, seed, how, step):
+def test_random_meshes_in_random_notation(tmp_path, shape, seed, how, step):
     rng = np.random.default_rng(seed)
     points = grid_points(shape, (1.0, 2.0, 3.0)) + rng.uniform(-0.1, 0.1, (np.prod(np.array(shape) + 1), 3))
     cells = structured_hexahedra(shape)

@@ -1,4 +1,4 @@
-"""The cloud in place of hexahedra, and the block: exact volumes, even nodes, the same bits, clear errors."""
+"""Clouds that replace hexahedra, and blocks: exact volumes, even nodes, reproducible bits, errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def tumour(centre, **keys):
 
 
 def distorted_block(n=10, h=0.004):
-    """Nodes and hexahedra of a block that is bent, twisted and stretched: no face of it is plane."""
+    """Nodes and hexahedra of a bent, twisted and stretched block without plane faces."""
     points = grid_points((n, n, n), (n * h,) * 3)
     x, y, z = (points / (n * h)).T
     shift = np.stack([0.2 * np.sin(3 * y) * z, 0.15 * x * x + 0.1 * z, 0.2 * x * y * z], axis=1)
@@ -33,35 +33,35 @@ def distorted_block(n=10, h=0.004):
 
 
 def flux_volume(points, faces):
-    """Volume within bilinear faces by the divergence theorem; 2 x 2 Gauss points are exact for it."""
+    """Volume inside bilinear faces by the divergence theorem, exact with 2 x 2 Gauss points."""
     p, total = points[faces], 0.0
     for s in (0.5 - 12**-0.5, 0.5 + 12**-0.5):
         for t in (0.5 - 12**-0.5, 0.5 + 12**-0.5):
-            place = np.array([(1 - s) * (1 - t), s * (1 - t), s * t, (1 - s) * t]) @ p
+            position = np.array([(1 - s) * (1 - t), s * (1 - t), s * t, (1 - s) * t]) @ p
             along_s, along_t = np.array([t - 1, 1 - t, t, -t]) @ p, np.array([s - 1, -s, s, 1 - s]) @ p
-            total += (place * np.cross(along_s, along_t)).sum() / 12
+            total += (position * np.cross(along_s, along_t)).sum() / 12
     return total
 
 
-def test_cutting_loses_nothing_on_distorted_hexahedra():
+def test_parts_of_distorted_hexahedra_keep_volume_and_moments():
     points, hexahedra = distorted_block()
     whole, centroids = volumes_and_centroids(points[hexahedra])
     cuts = np.random.default_rng(1).integers(1, 4, (len(hexahedra), 3))
-    parts, places = volumes_and_centroids(subdivide(points[hexahedra], cuts))
+    parts, positions = volumes_and_centroids(subdivide(points[hexahedra], cuts))
     owner = np.repeat(np.arange(len(hexahedra)), cuts.prod(axis=1))
     # Round-off: sums of up to 27 parts.
     np.testing.assert_allclose(np.bincount(owner, parts), whole, rtol=1e-13)
     for i in range(3):
-        np.testing.assert_allclose(np.bincount(owner, parts * places[:, i]), whole * centroids[:, i], rtol=1e-12)
+        np.testing.assert_allclose(np.bincount(owner, parts * positions[:, i]), whole * centroids[:, i], rtol=1e-12)
     assert whole.sum() == pytest.approx(flux_volume(points, boundary_faces(hexahedra)), rel=1e-12)
 
 
 @pytest.mark.parametrize("per_spacing", [0.8, 1.0, 1.4, 2.0, 2.6])
-def test_number_of_integration_cells_is_the_one_asked_for(per_spacing):
+def test_number_of_integration_cells_is_as_requested(per_spacing):
     points, hexahedra = grid_points((10, 10, 10), (0.04,) * 3), structured_hexahedra((10, 10, 10))
     cells = cut(points[hexahedra], Spacing(0.004), per_spacing, np.random.default_rng(0))
     wanted = max(per_spacing, 1.0) ** 3
-    # Each hexahedron draws between two numbers that differ by less than what is wanted: four standard errors.
+    # Each hexahedron has one of two numbers that differ by less than the wanted number: four standard errors.
     assert len(cells) / 1000 == pytest.approx(wanted, abs=4 * 0.5 * wanted / 1000**0.5)
 
 
@@ -80,10 +80,10 @@ def test_cloud_around_a_seed(shape):
     assert mesh.figures["void_volume_m3"] == pytest.approx(void, rel=1e-12)
     assert volumes.sum() == pytest.approx(void - SEED_VOLUME, rel=1e-12)
     assert volumes.min() > 0
-    # Before it is made exact, the sum is off by the sampling of cut cells: asked is 0.1 % of the seed.
+    # Before rescaling, the sum has the sampling error of cut cells: below 0.1 % of the seed.
     sampled = mesh.figures["integration_volume_before_rescaling_m3"]
     assert abs(sampled - (void - SEED_VOLUME)) < 1e-3 * SEED_VOLUME
-    # So are the first moments, in radii of the seed.
+    # The first moments, relative to the seed's volume and radius.
     moments = volumes @ mesh.integration_points
     cells, centroids = volumes_and_centroids(points[hexahedra[dropped]])
     np.testing.assert_allclose(moments, cells @ centroids - SEED_VOLUME * centre, atol=0.01 * SEED_VOLUME * 0.002)
@@ -98,19 +98,19 @@ def test_cloud_around_a_seed(shape):
     inner = mesh.points[mesh.node_sets["tumour"][-1] + 1 :]
     assert np.linalg.norm(inner - centre, axis=1).min() > 0.002
     assert (tree.query(inner, k=2)[0][:, 1] >= CLOSEST * spacing(inner) * (1 - 1e-12)).all()
-    # Holes: no place outside the seed is farther from a node than 1.25 spacings (0.87 on a cubic grid, 1.1 measured).
+    # No holes: each point outside the seed has a node within 1.25 spacings (0.87 on a cubic grid, 1.1 measured).
     rng = np.random.default_rng(3)
     corners = points[hexahedra[dropped]]
-    places = (rng.dirichlet(np.ones(8), (40, len(corners)))[..., None] * corners).sum(axis=2).reshape(-1, 3)
-    places = places[np.linalg.norm(places - centre, axis=1) > 0.002]
-    assert (tree.query(places)[0] / spacing(places)).max() < 1.25
-    # Next to the seed the spacing is that of the surface's nodes; it grows by less than `growth` a neighbour.
+    positions = (rng.dirichlet(np.ones(8), (40, len(corners)))[..., None] * corners).sum(axis=2).reshape(-1, 3)
+    positions = positions[np.linalg.norm(positions - centre, axis=1) > 0.002]
+    assert (tree.query(positions)[0] / spacing(positions)).max() < 1.25
+    # The spacing at the seed is that of the surface nodes, and it grows by `growth`.
     at_surface = np.sqrt(4 * np.pi * 0.002**2 / 400)
     assert spacing(seed)[0] == pytest.approx(at_surface)
     assert spacing(centre[None] + (0.004, 0, 0))[0] == pytest.approx(at_surface + 0.3 * 0.002)
 
 
-def test_hexahedra_that_remain_keep_their_nodes_and_no_node_is_orphaned():
+def test_remaining_hexahedra_keep_their_nodes_without_unused_nodes():
     points, hexahedra = distorted_block()
     dropped = np.linalg.norm(points[hexahedra].mean(axis=1) - points.mean(axis=0), axis=1) < 0.012
     gone = np.setdiff1d(np.unique(hexahedra[dropped]), np.unique(hexahedra[~dropped]))
@@ -123,7 +123,7 @@ def test_hexahedra_that_remain_keep_their_nodes_and_no_node_is_orphaned():
     assert len(mesh.node_sets["gone"]) == 0
 
 
-def test_same_deck_same_bits_and_another_seed_another_cloud():
+def test_equal_seeds_give_equal_bits_and_another_seed_another_cloud():
     points, hexahedra = distorted_block()
     dropped = np.linalg.norm(points[hexahedra].mean(axis=1) - points.mean(axis=0), axis=1) < 0.012
     one, two, other = (
@@ -154,8 +154,8 @@ def test_block(kind, with_tumour):
     assert hexahedra + mesh.integration_volumes.sum() == pytest.approx(total, rel=1e-12)
     assert (mesh.n_fe_nodes == 0) == (kind == "all")
     for i, axis in enumerate("xyz"):
-        for end, place in ((0, 0.0), (1, size[i])):
-            on_face = np.flatnonzero(mesh.points[:, i] == place)
+        for end, position in ((0, 0.0), (1, size[i])):
+            on_face = np.flatnonzero(mesh.points[:, i] == position)
             np.testing.assert_array_equal(mesh.node_sets[f"{axis}{end}"], on_face)
             assert len(on_face) == {"x": 13 * 9, "y": 11 * 9, "z": 11 * 13}[axis]
     corners = np.array([[x, y, z] for x in (0, size[0]) for y in (0, size[1]) for z in (0, size[2])])
@@ -176,7 +176,7 @@ def test_cloud_of_a_block_is_irregular_and_follows_its_spacing():
     mesh = block_mesh(block, deck.Cloud(spacing=0.005), None)
     assert len(mesh.node_sets["x0"]) == 9 * 9
     inner = np.setdiff1d(np.arange(mesh.n_nodes), mesh.node_sets["surface"])
-    # One node per cubed spacing, give or take what the boundary's nodes take away.
+    # About one node per cubed spacing, less near the boundary.
     assert len(inner) == pytest.approx(7**3, rel=0.1)
     assert len(np.unique(mesh.points[inner, 0])) == len(inner)
     assert len(np.unique(mesh.points[mesh.node_sets["x0"], 1])) > 7 * 9
@@ -193,7 +193,7 @@ def test_cloud_of_a_block_is_irregular_and_follows_its_spacing():
         ((0.02, 0.02, -0.05), 0.01, r"centre = \(20, 20, -50\) mm: is outside the body, 50 mm from it; move it inside"),
     ],
 )
-def test_a_seed_without_room_is_refused(centre, radius, message):
+def test_a_seed_that_does_not_fit_is_refused(centre, radius, message):
     block = deck.Block(size=(0.04,) * 3, elements=(10,) * 3, cloud="core")
     with pytest.raises(InputError, match=message) as error:
         block_mesh(block, deck.Cloud(radius=radius), tumour(centre))

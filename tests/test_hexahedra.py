@@ -14,8 +14,6 @@ from mpitled.cells.hexahedra import (
     check,
     corner_jacobians,
     geometry,
-    hadamard,
-    hourglass_stiffness,
     hourglass_vectors,
     nodal_mass,
     scaled_jacobian,
@@ -94,29 +92,6 @@ def test_affine_fields_have_their_gradient_and_no_hourglass_part(rule):
     assert np.linalg.matrix_rank(x).min() == 8
     moved = HOURGLASS_MODES.T - np.einsum("eai,ebi,bm->eam", B, points[cells], HOURGLASS_MODES.T)  # (4.20)
     assert np.abs(gamma - moved).max() < 1e-13
-
-
-def test_a_box_has_its_closed_form():
-    """B = +-1/4 of the edges' inverses, gamma = H, k = R (lambda + 2 mu) V (a^-2 + b^-2 + c^-2) / 16."""
-    edges = np.array([2.0, 3.0, 5.0])
-    B, volume = geometry(CUBE * edges, ONE)
-    assert volume == pytest.approx(30.0, rel=1e-15)
-    assert B[0] == pytest.approx(CORNERS / 4 / edges, rel=1e-15)
-    assert hourglass_vectors(CUBE * edges, ONE, B)[0] == pytest.approx(HOURGLASS_MODES.T, abs=1e-15)
-    k = hourglass_stiffness(B, volume, np.array([7.0]), 0.04 / 9)
-    assert k == pytest.approx(0.04 / 9 * 7 * 30 * (edges**-2).sum() / 16, rel=1e-14)
-
-
-def test_the_form_for_kernels_is_the_same_gradient():
-    points, cells, _ = distorted()
-    r, s, t = CORNERS.T
-    modes = np.stack([r, s, t, r * s, s * t, r * t])
-    for rule in ("mean", "centre"):
-        C, x_hourglass, volume = hadamard(points, cells, rule)
-        B, same = geometry(points, cells, rule)
-        np.testing.assert_array_equal(volume, same)
-        assert np.abs(np.einsum("ma,emi->eai", modes, C) / 8 - B).max() < 1e-13
-        assert np.abs(x_hourglass - np.einsum("ma,eai->emi", HOURGLASS_MODES, points[cells])).max() < 1e-14
 
 
 @pytest.mark.parametrize("seed", range(3))

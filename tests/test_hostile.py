@@ -1,4 +1,4 @@
-"""Input as an attacker would send it: a result, or one line; nothing followed, nothing run, no room for mere claims."""
+"""Hostile input gives a result or a one-line error; no links are followed, no code is run, no memory is wasted."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from mpitled.model.build import build
 from mpitled.readers import abaqus, tables
 from mpitled.results import compare
 
-#: Inputs of each reader here; `python tests/fuzz.py` is the long form.
+#: Inputs for each reader; `python tests/fuzz.py` is the long form.
 FEW = 40
 
 
@@ -44,8 +44,7 @@ def model(known, tmp_path):
     return path
 
 
-def test_every_reader_reads_its_whole_inputs(known, tmp_path):
-    """Else the fuzz would break what is broken already."""
+def test_every_reader_reads_its_valid_inputs(known, tmp_path):
     for name, reader in known.items():
         for number, files in enumerate(reader.inputs.values()):
             folder = tmp_path / name.replace("/", "-") / str(number)
@@ -55,7 +54,7 @@ def test_every_reader_reads_its_whole_inputs(known, tmp_path):
             reader.read(folder / next(iter(files)))
 
 
-def test_broken_inputs_end_in_a_result_or_one_line(known, tmp_path):
+def test_changed_inputs_give_a_result_or_one_line(known, tmp_path):
     slow = {"deck, with the time it takes", "decks of a mixed mesh"}
     for name, reader in known.items():
         ends = {attempt(reader, tmp_path, random.Random(f"{name} {i}")) for i in range(5 if name in slow else FEW)}
@@ -72,7 +71,7 @@ def refused(path, message, read=store.read_model):
 
 
 @pytest.mark.parametrize("name", ["points", "materials"])
-def test_nothing_is_followed_out_of_a_file(model, name):
+def test_links_out_of_a_file_are_not_followed(model, name):
     secret = model.with_name("secret.h5")
     with h5py.File(secret, "w") as file:
         file["x"] = np.zeros((9, 3))
@@ -106,7 +105,7 @@ def test_nothing_is_followed_out_of_a_file(model, name):
     ({"chunks": (1 << 20,), "compression": "gzip"}, store.read_model),
     ({"chunks": (1 << 20,), "compression": "gzip"}, lambda path: tables.read_grid(path)),
 ])  # fmt: skip
-def test_room_is_not_taken_for_what_a_dataset_claims(model, options, read):
+def test_datasets_that_claim_more_than_their_bytes_are_refused(model, options, read):
     for name in ("mass", "x"):
         with h5py.File(model, "r+") as file:
             file.pop(name, None)
@@ -116,8 +115,8 @@ def test_room_is_not_taken_for_what_a_dataset_claims(model, options, read):
     refused(model, "claims 8000000000000 bytes, and 0 are there", read)
 
 
-def test_a_bomb_of_integration_points_is_asked_for_its_room(tmp_path, monkeypatch):
-    """Two gigabytes of zeros in two megabytes: no claim of the file is wrong."""
+def test_strongly_compressed_integration_points_are_refused_by_their_memory(tmp_path, monkeypatch):
+    """All claims of the file are true."""
     path = tmp_path / "grid.h5"
     with h5py.File(path, "w") as file:
         for name in ("x", "y", "z", "volume"):
@@ -126,7 +125,7 @@ def test_a_bomb_of_integration_points_is_asked_for_its_room(tmp_path, monkeypatc
     refused(path, "its 1048576 points: would take 33.6 MB of memory", tables.read_grid)
 
 
-def test_numbers_that_kernels_would_follow_out_of_their_arrays_are_refused(model):
+def test_indices_outside_their_arrays_are_refused(model):
     whole = model.read_bytes()
     for name, value in (
         ("blocks/0/nodes", 10**9), ("blocks/1/nodes", -1), ("blocks/1/material", 7),
@@ -137,7 +136,7 @@ def test_numbers_that_kernels_would_follow_out_of_their_arrays_are_refused(model
         model.write_bytes(whole)
         with h5py.File(model, "r+") as file:
             file[name][-1] = value
-            file[name].attrs.pop("checksum", None)  # who means harm would make it fit
+            file[name].attrs.pop("checksum", None)  # an attacker would write a correct checksum
         read = (
             store.read_model
             if not name.startswith("partitions")
@@ -150,7 +149,7 @@ def test_numbers_that_kernels_would_follow_out_of_their_arrays_are_refused(model
 
 
 def nifti(*shape):
-    """A header that claims this shape, with a hundred bytes behind it."""
+    """A header that claims this shape, followed by a hundred bytes."""
     import nibabel
 
     head = bytearray(nibabel.Nifti1Image(np.zeros((2, 2, 2), np.uint8), np.eye(4)).to_bytes()[:352])
@@ -164,7 +163,7 @@ def test_an_image_that_claims_too_much_is_refused(tmp_path, monkeypatch):
     refused(plain, "claims 3.28e[+]13 voxels and has 452 bytes", read_image)
     packed.write_bytes(gzip.compress(nifti(32000, 32000, 32000)))
     refused(packed, "claims 3.28e[+]13 voxels", read_image)
-    # A bomb: what it claims is there, a thousand times smaller.
+    # A zip bomb: the claims are true, and the file is a thousand times smaller.
     packed.write_bytes(gzip.compress(nifti(300, 300, 300) + bytes(27_000_000)))
     monkeypatch.setattr(resources, "memory", lambda: 1 << 28)
     refused(packed, "its 2.7e[+]07 voxels: would take 1.51 GB of memory, and 268 MB are free", read_image)
@@ -174,7 +173,7 @@ def test_an_image_that_claims_too_much_is_refused(tmp_path, monkeypatch):
     refused(packed, "claims 2e[+]09 bytes before its voxels", read_image)
 
 
-def test_arrays_of_others_run_nothing_and_take_no_room(tmp_path, monkeypatch):
+def test_npz_files_run_no_code_and_are_limited_in_memory(tmp_path, monkeypatch):
     class Attack:
         def __reduce__(self):
             return os.mkdir, (str(tmp_path / "run by pickle"),)
@@ -193,7 +192,7 @@ def test_arrays_of_others_run_nothing_and_take_no_room(tmp_path, monkeypatch):
     refused(path, "its arrays: would take 50.3 MB of memory", lambda path: compare.read_reference(path, None))
 
 
-def test_what_has_no_end_is_not_read(tmp_path):
+def test_devices_and_pipes_are_not_read(tmp_path):
     deck = tmp_path / "deck.inp"
     for device in ("/dev/zero", str(tmp_path / "pipe")):
         if not Path(device).exists():
@@ -232,7 +231,7 @@ LARGE = {
 
 
 @pytest.mark.parametrize("key", LARGE)
-def test_a_deck_that_asks_for_too_much_is_refused_before_it_is_made(tmp_path, key):
+def test_decks_that_need_too_much_memory_are_refused_before_allocation(tmp_path, key):
     deck = tmp_path / "deck.toml"
     deck.write_text(SCENE.format(geometry=LARGE[key]))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -240,8 +239,8 @@ def test_a_deck_that_asks_for_too_much_is_refused_before_it_is_made(tmp_path, ke
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1 << 16  # KiB
 
 
-def test_memory_is_what_the_process_may_still_take(tmp_path):
-    """In a process with a limit of its own, as batch systems set one."""
+def test_the_memory_limit_of_the_process_counts(tmp_path):
+    """Batch systems set such limits."""
     deck = tmp_path / "deck.toml"
     deck.write_text(SCENE.format(geometry="[block]\nsize = [1.0, 1.0, 1.0]\nelements = [200, 200, 200]"))
     code = (
@@ -255,14 +254,14 @@ def test_memory_is_what_the_process_may_still_take(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["a." * 20000 + "a = 1", "[" * 100000, "x = 0x" + "f" * 100000, "#" * (1 << 21)])
-def test_toml_that_takes_long_to_parse_is_refused(tmp_path, text):
+def test_toml_with_excessive_structure_is_refused(tmp_path, text):
     deck = tmp_path / "deck.toml"
     deck.write_text(text)
     refused(deck, "deck.toml: ", load_deck)
 
 
-def test_names_do_not_lead_out_of_the_folder(tmp_path):
-    """Titles, materials, spheres and sets are words: none of them becomes a path."""
+def test_names_do_not_become_paths(tmp_path):
+    """Names are titles, materials, spheres and sets."""
     deck, out = tmp_path / "deck.toml", tmp_path / "out"
     name = f"../../{30 * 'x'}/../"
     deck.write_text(
@@ -277,4 +276,4 @@ def test_names_do_not_lead_out_of_the_folder(tmp_path):
     mpitled("check", out / "export" / "scene.toml")
     assert {path.name for path in tmp_path.iterdir()} == {"deck.toml", "out"}
     assert not [path for path in tmp_path.parent.iterdir() if path.name.startswith("x")]
-    assert Path(vary.folder(name, "content")).name == vary.folder(name, "content")
+    assert Path(vary.folder_name(name, "content")).name == vary.folder_name(name, "content")

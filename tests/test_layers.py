@@ -1,4 +1,4 @@
-"""Clouds of several materials: domains keep to their own, so that a strain with a kink at the interface is exact."""
+"""Clouds of several materials: a strain that jumps at the interface is exact."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mpitled.results import field
 
 EPS = np.finfo(float).eps
 CONTRAST = 1000.0
-#: The upper half is of another material: a sphere so large that no hexahedron is cut by what it bends.
+#: The upper half has another material, inside a sphere so large that its surface is nearly plane.
 LAYERS = """
 [block]
 size = [32.0, 28.0, 24.0]
@@ -30,7 +30,7 @@ elements = [8, 7, 6]
 cloud = "{cloud}"
 core_share = 0.7
 [cloud]
-irregularity = {irregularity} # where the cloud is all, it would move the interface's nodes on the surface
+irregularity = {irregularity} # 0 with cloud = "all": interface nodes on the surface must not move
 [sphere.upper]
 centre = [16.0, 14.0, 1012.0]
 radius = 1000.0
@@ -63,7 +63,7 @@ def deck_of(folder, cloud, contrast=CONTRAST, more=""):
 
 
 def residual(model):
-    """Largest force off the surface in the layers' exact deformation, as a share of the largest on the surface."""
+    """Largest inner nodal force in the exact deformation, relative to the largest force on the surface."""
     rows = part(
         model.points, model.hexahedra, model.domains, model.domain_gradients, model.domain_volumes, model.material
     )
@@ -79,11 +79,11 @@ def residual(model):
 @pytest.mark.parametrize("cloud", ["none", "core", "all"])
 @pytest.mark.parametrize("support", ["", "nodes = 12", "basis = 10\nnodes = 24"])
 def test_layers_are_exact_to_round_off(tmp_path, cloud, contrast, support):
-    """Each layer is strained alike, a thousand times less in the stiffer: all nodes off the surface are in balance."""
+    """The strain is uniform in each layer, and inner nodes are in balance."""
     scene = deck.load_deck(deck_of(tmp_path, cloud, contrast, f"[support]\n{support}\n"))
     mesh = read_mesh(scene)
     model = discretise(scene, mesh)
-    # The patch test's bound (test_support), and the stiffer layer's stress is a difference of ones.
+    # The bound of the patch test (test_support) times the contrast, because of cancellation in the stiffer layer.
     assert residual(model) < 18 * 20 * EPS * 49 * CONTRAST
     if cloud != "none":
         assert model.figures.domains_across == 0
@@ -93,8 +93,8 @@ def test_layers_are_exact_to_round_off(tmp_path, cloud, contrast, support):
 
 
 @pytest.mark.parametrize("cloud", ["core", "all"])
-def test_domains_keep_to_their_material(tmp_path, cloud):
-    """Nodes of a domain are on its own side or on the interface, and the interface's are in domains of both."""
+def test_domains_have_nodes_of_one_material(tmp_path, cloud):
+    """Nodes of a domain are on its side or on the interface; interface nodes are in domains of both sides."""
     scene = deck.load_deck(deck_of(tmp_path, cloud))
     mesh = read_mesh(scene)
     model = discretise(scene, mesh)
@@ -110,7 +110,7 @@ def test_domains_keep_to_their_material(tmp_path, cloud):
 
 
 def test_parts_of_a_cloud_have_their_surfaces(tmp_path):
-    """Areas of a closed surface sum to nothing, and with the places to the part's volume; nodes keep their distance."""
+    """Areas of a closed surface sum to zero, and their moments to the part's volume."""
     mesh = read_mesh(deck.load_deck(deck_of(tmp_path, "core")))
     assert [sorted(p.spheres) for p in mesh.parts] == [[], ["upper"]]
     for one in mesh.parts:
@@ -126,29 +126,29 @@ def test_parts_of_a_cloud_have_their_surfaces(tmp_path):
 
 
 @pytest.mark.parametrize("n", [1, 2])
-def test_layers_come_to_rest_where_they_should(tmp_path, n):
+def test_layers_relax_to_the_exact_solution(tmp_path, n):
     path = deck_of(tmp_path, "core", 100.0)
     mpitled("run", path, "--out", tmp_path / "run", n=n)
     ours = field.open_field(tmp_path / "run")
     model = store.read_model(tmp_path / "run" / "model.h5")
     true = layers(model, model.points, 0.0)
-    # What relaxation leaves, by its own bound.
+    # The remaining error of the relaxation.
     assert np.abs(ours.at_nodes - true).max() < 1e-7
-    middles = model.points[model.hexahedra].mean(axis=1)
-    assert np.abs(ours.at(middles).displacement - layers(model, middles, 0.0)).max() < 1e-7
+    midpoints = model.points[model.hexahedra].mean(axis=1)
+    assert np.abs(ours.at(midpoints).displacement - layers(model, midpoints, 0.0)).max() < 1e-7
 
 
-def test_an_export_says_that_domains_will_be_others(tmp_path):
-    for cloud, says in (("all", True), ("none", False)):
+def test_an_export_notes_that_domains_differ(tmp_path):
+    for cloud, expected in (("all", True), ("none", False)):
         mpitled("build", deck_of(tmp_path, cloud), "--out", tmp_path / cloud)
         mpitled("export", tmp_path / cloud, "--abaqus", "--out", tmp_path / "decks")
         text = (tmp_path / "decks" / "scene.toml").read_text()
-        assert ("nodes of its own material only" in text) == says
+        assert ("nodes of its own material only" in text) == expected
         assert deck.load_deck(tmp_path / "decks" / "scene.toml").mesh is not None
 
 
-def test_a_layer_with_too_few_nodes_takes_of_all(tmp_path):
-    """One layer of two by two hexahedra has 18 nodes and perhaps one within, of which no 24 can be had."""
+def test_domains_of_a_layer_with_too_few_nodes_take_nodes_of_the_whole_cloud(tmp_path):
+    """A layer of two by two hexahedra has 18 nodes and perhaps an inner one, fewer than 24."""
     text = text_of("all", 0.01).replace("[8, 7, 6]", "[2, 2, 6]").replace("1012.0", "1020.0")
     path = tmp_path / "thin.toml"
     path.write_text(text + "[support]\nnodes = 24\nmax_fe_nodes = 24\n")
@@ -162,8 +162,8 @@ def test_a_layer_with_too_few_nodes_takes_of_all(tmp_path):
         build(deck.load_deck(path))
 
 
-def test_spheres_apart_are_parts_that_share_nothing(tmp_path):
-    """Two spheres, one of them in the middle of the cloud and one in hexahedra and cloud, and the rest around."""
+def test_separate_spheres_are_parts(tmp_path):
+    """One sphere in the middle of the cloud, and one in hexahedra and cloud."""
     more = "".join(
         f"[sphere.{name}]\ncentre = [{x}, 14, 6]\nradius = 4\n[material.{name}]\nyoungs_modulus = {modulus}\n"
         f'poissons_ratio = 0.1\ncells = ["{name}"]\n'
@@ -180,8 +180,8 @@ def test_spheres_apart_are_parts_that_share_nothing(tmp_path):
     assert model.figures.consistency_after < 100 * EPS
 
 
-def test_a_cloud_is_as_fine_as_the_interface(tmp_path):
-    """Hexahedra that are finer on one side of the block: next to the interface nodes lie as densely as its faces."""
+def test_a_cloud_is_as_fine_as_the_interface():
+    """Near the interface the spacing is the size of its faces, although the element size is larger."""
     points, hexahedra = grid_points((12, 12, 8), (0.024, 0.024, 0.032)), structured_hexahedra((12, 12, 8))
     sphere = deck.Sphere(name="upper", centre=(0.012, 0.012, 1.016), radius=1.0)
     dropped = np.ones(len(hexahedra), bool)
@@ -193,8 +193,8 @@ def test_a_cloud_is_as_fine_as_the_interface(tmp_path):
     volume = 0.02 * 0.02 * 0.008
     assert inside[0].sum() < 0.5 * volume / 0.002**3
     assert inside[1].sum() == pytest.approx(volume / 0.002**3, rel=0.3)
-    middles = (points[:12] + points[14:26]) / 2 + [0, 0, 0.016]
-    np.testing.assert_allclose(spacing(middles), 0.002, rtol=1e-9)
+    midpoints = (points[:12] + points[14:26]) / 2 + [0, 0, 0.016]
+    np.testing.assert_allclose(spacing(midpoints), 0.002, rtol=1e-9)
     scattered = fine.points[-len(fine.points) // 4 :]
     away = np.linalg.norm(scattered[:, None] - scattered, axis=2) + np.eye(len(scattered))
     assert (away.min(axis=1) >= CLOSEST * spacing(scattered) * (1 - 1e-12)).all()

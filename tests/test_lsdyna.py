@@ -1,4 +1,4 @@
-"""LS-DYNA decks: fixed columns of every width, commas, parameters, sets, constraints, and true errors."""
+"""LS-DYNA decks: fixed columns of every width, commas, parameters, sets, constraints, and errors with file and line."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ WRITTEN = {
 
 
 @pytest.mark.parametrize("how", WRITTEN)
-def test_the_same_content_written_otherwise_is_the_same(tmp_path, how):
-    """Also as Abaqus has it: the same nodes, elements, sets, constraints and materials."""
+def test_every_notation_gives_the_same_model(tmp_path, how):
+    """It is also the model of the Abaqus deck: nodes, elements, sets, constraints and materials."""
     plain, other = read(tmp_path, DYNA), read(tmp_path, WRITTEN[how], "other.k")
     if how == "node by node":  # four constraints on one node each
         assert sorted(
@@ -91,7 +91,7 @@ def test_includes_with_the_rest_of_the_deck(tmp_path):
     assert_same(read(tmp_path, DYNA), read(tmp_path, text, "including.k"))
 
 
-def test_degenerate_solids_are_what_they_are(tmp_path):
+def test_degenerate_solids_get_their_kind(tmp_path):
     """All in the unit cube: volumes 1/6 (tetrahedron), 1/2 (wedge) and 1/3 (pyramid)."""
     rows = {"tetrahedron": [15, 10, 20, 110] + [110] * 4, "wedge": [10, 20, 25, 15, 110, 110, 115, 115],
             "pyramid": [10, 20, 25, 15] + [110] * 4, "hexahedron": [10, 20, 25, 15, 110, 120, 125, 115]}  # fmt: skip
@@ -152,9 +152,9 @@ WRONG = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("what", WRONG)
-def test_errors_name_file_line_and_culprit(tmp_path, what):
-    text, words = WRONG[what]
+@pytest.mark.parametrize("case", WRONG)
+def test_errors_name_file_and_cause(tmp_path, case):
+    text, words = WRONG[case]
     with pytest.raises(InputError) as caught:
         read(tmp_path, text)
     assert words in str(caught.value)
@@ -171,7 +171,7 @@ def test_errors_name_file_line_and_culprit(tmp_path, what):
         ("*CONSTRAINED_NODE_SET\n         1\n", "*CONSTRAINED_NODE_SET"),
     ],
 )
-def test_what_changes_the_mechanics_is_refused_by_name_and_line(tmp_path, more, words):
+def test_unsupported_mechanics_are_refused_with_name_and_line(tmp_path, more, words):
     path = tmp_path / "deck.k"
     path.write_text(DYNA.replace("*PART\n", more + "*PART\n"))
     with pytest.raises(InputError) as caught:
@@ -189,16 +189,12 @@ def test_what_changes_the_mechanics_is_refused_by_name_and_line(tmp_path, more, 
     two_lines=st.booleans(),
     step=st.integers(1, 10_000),
 )
-def test_random_meshes_in_random_dress(tmp_path, shape, seed, layout, end, two_lines, step):
+def test_random_meshes_in_random_notation(tmp_path, shape, seed, layout, end, two_lines, step):
     rng = np.random.default_rng(seed)
-    # As many digits as sixteen columns hold.
-    points = np.array(
-        [
-            [float(f"{x:.9e}") for x in row]
-            for row in grid_points(shape, (1.0, 2.0, 3.0)) + rng.uniform(-0.1, 0.1, (np.prod(np.array(shape) + 1), 3))
-        ]
-    )
-    cells, ids = structured_hexahedra(shape), rng.permutation(int(np.prod(np.array(shape) + 1))) * step + 1
+    points = grid_points(shape, (1.0, 2.0, 3.0))
+    points += rng.uniform(-0.1, 0.1, points.shape)
+    points = np.array([[float(f"{x:.9e}") for x in row] for row in points])  # sixteen columns hold these digits
+    cells, ids = structured_hexahedra(shape), rng.permutation(len(points)) * step + 1
     width = {"standard": 8, "i10": 10, "long": 20, "commas": 0}[layout]
 
     def line(integers: list[int], reals: list[float] = []) -> str:  # noqa: B006

@@ -1,4 +1,4 @@
-"""Displacements at scattered places, carried over to nodes: exactly where they can be, at third order elsewhere."""
+"""Displacements interpolated from scattered points to nodes: exact quadratic fields, and third-order convergence."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ field = "field.csv"
 """
 
 
-def write(path, places, values):
-    rows = np.hstack([places, values])
+def write(path, points, values):
+    rows = np.hstack([points, values])
     np.savetxt(path, rows, "%.17g", ",", header="x,y,z,ux,uy,uz", comments="")
     return path
 
@@ -38,12 +38,12 @@ def smooth(x):
 
 
 def test_error_on_a_surface_falls_with_the_cube_of_the_distance(tmp_path):
-    """Nodes lie between the places and, as a hexahedron's face does, a little below the surface."""
+    """Nodes lie between the points."""
     nodes = 50 * fibonacci_sphere(701)
     errors = []
     for n in (2000, 8000):
-        places = 50 * fibonacci_sphere(n)
-        path = write(tmp_path / f"{n}.csv", places, smooth(places))
+        points = 50 * fibonacci_sphere(n)
+        path = write(tmp_path / f"{n}.csv", points, smooth(points))
         found = mapping.carry_over(path, 1e-3, 1e-3 * nodes, "here")
         errors.append(np.abs(1e3 * found - smooth(nodes)).max())
     assert errors[0] < 0.02  # mm, of 1
@@ -51,28 +51,28 @@ def test_error_on_a_surface_falls_with_the_cube_of_the_distance(tmp_path):
 
 
 def test_quadratic_fields_are_exact_in_a_volume_and_in_a_plane(tmp_path):
-    """Whatever the places; in a plane the fit must not ask for slopes across it. A node at a place has its value."""
+    """In a plane the points do not determine slopes across it. A node at a point has exactly the point's value."""
     rng = np.random.default_rng(2)
     terms = rng.normal(size=(10, 3))
     for flat in (1.0, 0.0):
-        places, nodes = (rng.uniform(-20, 20, (n, 3)) * [1, 1, flat] for n in (900, 50))
+        points, nodes = (rng.uniform(-20, 20, (n, 3)) * [1, 1, flat] for n in (900, 50))
 
         def field(x):
             x, y, z = x.T
             return np.stack([1 + 0 * x, x, y, z, x * x, y * y, z * z, x * y, y * z, x * z], axis=1) @ terms
 
-        path = write(tmp_path / "f.csv", places, field(places))
+        path = write(tmp_path / "f.csv", points, field(points))
         found = 1e3 * mapping.carry_over(path, 1e-3, 1e-3 * nodes, "here")
-        np.testing.assert_allclose(found, field(nodes), atol=1e-9 * np.abs(field(places)).max())
-    noise = rng.normal(size=places.shape)
-    found = mapping.carry_over(write(tmp_path / "f.csv", places, noise), 1e-2, 1e-2 * places[::9], "here")
+        np.testing.assert_allclose(found, field(nodes), atol=1e-9 * np.abs(field(points)).max())
+    noise = rng.normal(size=points.shape)
+    found = mapping.carry_over(write(tmp_path / "f.csv", points, noise), 1e-2, 1e-2 * points[::9], "here")
     np.testing.assert_array_equal(found, 1e-2 * noise[::9])
 
 
 def test_field_in_the_deck(tmp_path):
-    """In the directions asked for, in the unit said, on top of which nothing else is moved."""
-    places = 50 * fibonacci_sphere(1500)
-    write(tmp_path / "field.csv", places / 10, smooth(places) / 10)
+    """In the directions and the unit of the deck."""
+    points = 50 * fibonacci_sphere(1500)
+    write(tmp_path / "field.csv", points / 10, smooth(points) / 10)
     path = tmp_path / "scene.toml"
     path.write_text(SCENE + 'field_unit = "cm"\ndirections = ["x", "z"]\n')
     model = model_build.build(deck.load_deck(path))
@@ -86,20 +86,20 @@ def test_field_in_the_deck(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda rows: rows[:19], r"field.csv: has 19 places; give at least 20"),
+        (lambda rows: rows[:19], r"field.csv: has 19 points; give at least 20"),
         (
             lambda rows: rows[rows[:, 0] < 0],
-            r"scene.toml: displaced.0.field: the node at \(50, .* from the nearest place",
+            r"scene.toml: displaced.0.field: the node at \(50, .* from the nearest point",
         ),
-        (lambda rows: 10 * rows, r"displaced.0.field: the node at .* or see to the unit"),
-        (lambda rows: np.concatenate([rows, rows[:1]]), r"line 2: the same place is there twice"),
+        (lambda rows: 10 * rows, r"displaced.0.field: the node at .* or check the unit"),
+        (lambda rows: np.concatenate([rows, rows[:1]]), r"line 2: the same point is given twice"),
         (lambda rows: rows[:, :5], r"line 1.*|line 2: has 5 numbers; give x, y, z, ux, uy, uz"),
         (lambda rows: np.where(rows == rows[3, 5], 1e99, rows), r"line 5: a number is beyond"),
     ],
 )
-def test_what_is_wrong_with_a_field_is_said_in_a_line(tmp_path, change, message):
-    places = 50 * fibonacci_sphere(1500)
-    rows = change(np.hstack([places, smooth(places)]))
+def test_invalid_fields_are_refused(tmp_path, change, message):
+    points = 50 * fibonacci_sphere(1500)
+    rows = change(np.hstack([points, smooth(points)]))
     np.savetxt(tmp_path / "field.csv", rows, "%.17g", ",", header="x,y,z,ux,uy,uz", comments="")
     (tmp_path / "scene.toml").write_text(SCENE)
     with pytest.raises(InputError, match=message) as caught:
@@ -107,17 +107,8 @@ def test_what_is_wrong_with_a_field_is_said_in_a_line(tmp_path, change, message)
     assert "\n" not in str(caught.value)
 
 
-def test_either_displacement_or_field(tmp_path):
-    (tmp_path / "scene.toml").write_text(SCENE)
-    (tmp_path / "field.csv").touch()
-    with pytest.raises(InputError, match=r"displaced.0.field = .*: cannot be combined with displacement"):
-        deck.load_deck(tmp_path / "scene.toml", ["displaced.0.displacement=[0,0,1]"])
-    with pytest.raises(InputError, match=r"displaced.0.displacement: is missing; .* or displaced.field"):
-        deck.load_deck(tmp_path / "scene.toml", ['displaced=[{nodes="surface"}]'])
-
-
 def test_the_bump_of_the_validation_is_known_exactly():
-    """To 0.003 mm, of 10 mm, at the nodes of its deck: far less than any error of the solution."""
+    """The table gives the bump of 10 mm to 0.003 mm at the nodes of its deck, less than errors of the solution."""
     scene = deck.load_deck(ROOT / "jobs" / "validation" / "bump.toml", ["ellipsoid.cloud=none"])
     mesh = model_build.read_mesh(scene)
     nodes = mesh.points[mesh.node_sets["surface"]]

@@ -1,4 +1,4 @@
-"""The mixed mesh of files, its checks, meshio's formats, and the export: all the way to a run."""
+"""Mixed meshes from files, their checks, the formats of meshio, and the export."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def edit(path: Path, old: str, new: str) -> None:
 
 def test_the_cloud_is_merged_into_the_void(void):
     mesh = meshes.read_mesh(load_deck(void / "scene.toml").mesh)
-    # 6^3 grid nodes less the 2^3 inside; the cloud repeats the 4^3 - 2^3 on the interface.
+    # 6^3 grid nodes without 2^3 inner nodes; the cloud repeats the 4^3 - 2^3 nodes of the interface.
     assert (mesh.n_fe_nodes, mesh.n_nodes) == (6**3 - 2**3, 6**3)
     assert len(mesh.node_sets["interface"]) == 4**3 - 2**3
     assert (mesh.node_sets["interface"] < mesh.n_fe_nodes).all()
@@ -96,7 +96,7 @@ def test_the_cloud_is_merged_into_the_void(void):
     assert len(mesh.hexahedra) == 5**3 - 3**3
     assert mesh.integration_volumes.sum() == pytest.approx(27e-9, rel=1e-14)
     assert np.abs(mesh.points).max() == 5e-3
-    # Both keep the numbers of their files, FE first.
+    # Nodes keep the numbers of their files.
     assert mesh.node_ids[0] == 1
     assert mesh.node_ids[mesh.n_fe_nodes :].tolist() == [22, 23, 26, 27, 38, 39, 42, 43]
     assert mesh.cell_sets["cloud"].tolist() == list(range(len(mesh.hexahedra), mesh.n_cells))
@@ -106,7 +106,7 @@ def test_the_cloud_is_merged_into_the_void(void):
     assert model.figures.consistency_after < 1e-13
 
 
-def test_units_are_each_file_s_own(void):
+def test_each_file_has_its_unit(void):
     section = load_deck(void / "scene.toml").mesh
     in_mm = meshes.read_mesh(section)
     for name in ("efg.inp", "grid.csv"):
@@ -126,7 +126,7 @@ def test_units_are_each_file_s_own(void):
 
 
 def test_integration_points_from_dropped_hexahedra(void, tmp_path):
-    """Cut in k^3: as many points, the exact volume, and the sets and the material of the hexahedra that are gone."""
+    """k^3 points for each hexahedron, with the exact volume and the sets and material of the hexahedra."""
     shape = (5, 5, 5)
     points, cells = grid_points(shape, (5.0, 5.0, 5.0)), structured_hexahedra(shape)
     centre = points[cells].mean(axis=1)
@@ -181,10 +181,10 @@ def test_grids_in_hdf5_and_with_sets(void):
     assert sets["a"].tolist() == [0, 2]
     assert sets["b b"].tolist() == [0]
     mesh = meshes.read_mesh(load_deck(void / "scene.toml").mesh)
-    assert mesh.cell_sets["cloud"].tolist() == [len(mesh.hexahedra) + 1]  # what no set has
+    assert mesh.cell_sets["cloud"].tolist() == [len(mesh.hexahedra) + 1]  # the point without a set
 
 
-def test_constraints_and_materials_of_the_files_count_with_those_of_the_deck(void):
+def test_constraints_of_file_and_deck_are_combined(void):
     scene = void / "scene.toml"
     model = build(load_deck(scene))
     skull = model.node_sets["skull"]
@@ -195,15 +195,15 @@ def test_constraints_and_materials_of_the_files_count_with_those_of_the_deck(voi
         build(load_deck(scene))
 
 
-def test_a_deck_replaces_what_the_files_prescribe_where_it_names_dofs(void):
-    """The file holds the skull in x, y and z; the deck moves it along x, for which one remark is enough."""
+def test_a_deck_replaces_prescribed_dofs_of_the_file(void):
+    """The file fixes the skull in x, y and z; the deck moves it along x. There is one remark."""
     scene = void / "scene.toml"
     edit(scene, "displacement = [0.0]", "displacement = [1.0]")
     model = build(load_deck(scene))
     np.testing.assert_array_equal(model.prescribed_displacements, np.tile([1e-3, 0, 0], len(model.node_sets["skull"])))
-    said = [remark for remark in model.remarks if " replaces what " in remark]
+    replaced = [remark for remark in model.remarks if " replaces what " in remark]
     n = len(model.node_sets["skull"])
-    assert said == [f"{scene}: displaced.0 replaces what {void / 'fe.inp'} prescribes at {n} nodes"]
+    assert replaced == [f"{scene}: displaced.0 replaces what {void / 'fe.inp'} prescribes at {n} nodes"]
     twice = scene.read_text() + '[[fixed]]\nnodes = "skull"\n'
     scene.write_text(twice)
     with pytest.raises(InputError, match=r"displaced\.0.* moved by 1 mm in x, and by 0 mm through .*fixed\.0"):
@@ -213,15 +213,15 @@ def test_a_deck_replaces_what_the_files_prescribe_where_it_names_dofs(void):
 # ------------------------------------------------------------ checks
 
 
-def test_volumes_and_points_that_do_not_fit_the_void_are_warned_about(void):
+def test_integration_points_that_do_not_fit_the_void_cause_warnings(void):
     scene = void / "scene.toml"
     edit(void / "grid.csv", "0.125", "0.925")
-    (said,) = warnings(meshes.read_mesh(load_deck(scene).mesh))
-    assert "sum to 27.8 mm3, the void has 27 mm3" in said
+    (warning,) = warnings(meshes.read_mesh(load_deck(scene).mesh))
+    assert "sum to 27.8 mm3, the void has 27 mm3" in warning
     edit(void / "grid.csv", "0.925", "0.125")
     edit(void / "grid.csv", "1.25, 1.25, 1.25", "0.25, 1.25, 1.25")
-    (said,) = warnings(meshes.read_mesh(load_deck(scene).mesh))
-    assert "1 integration points lie in hexahedra" in said
+    (warning,) = warnings(meshes.read_mesh(load_deck(scene).mesh))
+    assert "1 integration points lie in hexahedra" in warning
     edit(void / "grid.csv", "0.25, 1.25, 1.25, 0.125", "0.25, 1.25, 1.25, -0.125")
     with pytest.raises(InputError, match=r"grid.csv: line 2: .* positive volume \(1 such\)"):
         meshes.read_mesh(load_deck(scene).mesh)
@@ -236,7 +236,7 @@ ORDERS = {
 
 
 @pytest.mark.parametrize("how", ORDERS)
-def test_wrong_node_orders_are_repaired_only_when_asked(tmp_path, how):
+def test_wrong_node_orders_are_repaired_on_request(tmp_path, how):
     nodes = np.array([10, 20, 25, 15, 110, 120, 125, 115])[ORDERS[how]]
     text = FLAT.replace("7, 10, 20, 25, 15, 110, 120, 125, 115", ", ".join(map(str, [7, *nodes])))
     path = tmp_path / "deck.inp"
@@ -254,9 +254,9 @@ def test_wrong_node_orders_are_repaired_only_when_asked(tmp_path, how):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        # Two of the element's nodes at the level of its base.
+        # The top nodes at the level of the base.
         ("0., 1.\n", "0., 1e-9\n", "2 hexahedra are inverted or flat, the first is element 7; correct"),
-        # It would be twice as stiff and twice as heavy, without any other sign.
+        # Stiffness and mass would be doubled.
         (
             "*NSET, NSET=left",
             "9, 25, 15, 10, 20, 125, 115, 110, 120\n*NSET, NSET=left",
@@ -291,14 +291,14 @@ def test_meshes_that_cannot_be_computed_are_refused(tmp_path, old, new, message)
             },
             "the mesh is in 2 pieces that share no node",
         ),
-        ({" left, 1, 3": "** left"}, "rigid"),  # right is moved along x only
+        ({" left, 1, 3": "** left"}, "rigid"),  # the set right is prescribed along x only
         (
             {"*ELEMENT": "*NODE\n 1, 1., 0., 0.\n*ELEMENT", " 3, 20,": " 3, 1,"},
             "1 nodes lie where another one does, the first is node 1",
         ),
     ],
 )
-def test_doubtful_meshes_get_a_remark(tmp_path, changes, words):
+def test_suspicious_meshes_get_a_remark(tmp_path, changes, words):
     text = FLAT
     for old, new in changes.items():
         text = text.replace(old, new, 1)
@@ -306,7 +306,7 @@ def test_doubtful_meshes_get_a_remark(tmp_path, changes, words):
     assert words in overview.check(tmp_path / "deck.inp")
 
 
-def test_check_prints_what_is_in_a_file_and_in_a_deck(void):
+def test_check_prints_the_contents_of_a_file_and_a_deck(void):
     (void / "flat.inp").write_text(FLAT)
     printed = mpitled("check", void / "flat.inp").stdout
     for line in (
@@ -332,7 +332,7 @@ def test_check_prints_what_is_in_a_file_and_in_a_deck(void):
 
 
 @pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".msh", ".med", ".xdmf", ".mesh"])
-def test_what_meshio_reads_comes_in_with_its_sets(tmp_path, suffix):
+def test_formats_of_meshio_are_read_with_their_sets(tmp_path, suffix):
     points, cells = grid_points((2, 1, 1), (2.0, 1.0, 1.0)), structured_hexahedra((2, 1, 1))
     part = np.array([1, 2], np.int32)
     data = {"part": [part]}
@@ -349,14 +349,14 @@ def test_what_meshio_reads_comes_in_with_its_sets(tmp_path, suffix):
         mesh.cell_tags = {-1: ["grey"], -2: ["white"]}
     path = tmp_path / f"mesh{suffix}"
     mesh.write(path, **({"file_format": "gmsh22"} if suffix == ".msh" else {}))
-    made = meshes.read_mesh(MeshFiles(fe=path))
-    np.testing.assert_array_equal(made.hexahedra, cells)
-    np.testing.assert_array_equal(made.points, points)
+    result = meshes.read_mesh(MeshFiles(fe=path))
+    np.testing.assert_array_equal(result.hexahedra, cells)
+    np.testing.assert_array_equal(result.points, points)
     names = ["grey", "white"] if suffix in (".msh", ".med") else [f"{next(iter(data))} {i}" for i in (1, 2)]
-    assert [made.cell_sets[name].tolist() for name in names] == [[0], [1]]
+    assert [result.cell_sets[name].tolist() for name in names] == [[0], [1]]
 
 
-def test_what_meshio_cannot_read_is_one_line(tmp_path):
+def test_invalid_files_of_meshio_are_refused(tmp_path):
     for name, text in (("a.vtu", "<VTKFile"), ("a.msh", "$MeshFormat\n4.1 0 8\n"), ("a.obj", "v"), ("a.txt", "hello")):
         (tmp_path / name).write_text(text)
         with pytest.raises(InputError) as caught:
@@ -369,7 +369,7 @@ def test_what_meshio_cannot_read_is_one_line(tmp_path):
 
 
 def test_an_exported_model_runs_to_the_same_bits(tmp_path):
-    """Block, core cloud, tumour, fixed, displaced and turned sets, two materials: from decks as from the block."""
+    """Block, core cloud, tumour, fixed, displaced and rotated sets, two materials."""
     (tmp_path / "scene.toml").write_text(GROWTH)
     mpitled("run", tmp_path / "scene.toml", "--out", tmp_path / "a")
     printed = mpitled("export", tmp_path / "a", "--abaqus", "--out", tmp_path / "decks").stdout.split()
@@ -399,11 +399,8 @@ def test_an_exported_model_runs_to_the_same_bits(tmp_path):
         assert one.tobytes() == other.tobytes()
 
 
-def test_exported_materials_are_read_as_what_they_were(void):
-    """Each cell has one of its own, by C10 and D1, from which E and nu come back but for round-off.
-
-    Shear and bulk modulus take 2 and 3 roundings, the way through D1 and back 2 more, E of both 5, and nu 4.
-    """
+def test_exported_materials_are_read_with_the_same_moduli(void):
+    """Each cell has another material. The export has C10 and D1, and E and nu are recovered to round-off."""
     model = build(load_deck(void / "scene.toml"))
     rng, n = np.random.default_rng(0), model.n_cells
     laws = zip(10 ** rng.uniform(-3, 12, n), rng.uniform(-0.99, 0.4999, n), strict=True)
@@ -411,7 +408,8 @@ def test_exported_materials_are_read_as_what_they_were(void):
         Material(f"m{i}", NeoHookean(youngs_modulus=float(E), poissons_ratio=float(nu)), 1000.0)
         for i, (E, nu) in enumerate(laws)
     ]
-    model = replace(model, materials=tuple(given), material=np.arange(n, dtype=np.int16))
+    blocks = [replace(block, material=np.arange(n, dtype=np.int16)[cells]) for cells, block in model.numbered()]
+    model = replace(model, materials=tuple(given), blocks=tuple(blocks))
     store.write_model(void / "model.h5", model, "key", {})
     export.write_abaqus(void / "model.h5", void / "decks")
     file = meshes.read_file(void / "decks" / "fe.inp")
@@ -438,7 +436,7 @@ def test_an_exported_model_of_one_kind_of_cell_is_the_same(tmp_path, cloud):
         assert one[name].tobytes() == other[name].tobytes(), name
 
 
-def test_a_changed_include_builds_the_model_anew(tmp_path):
+def test_a_changed_include_rebuilds_the_model(tmp_path):
     (tmp_path / "nodes.inp").write_text(FLAT[: FLAT.index("*ELEMENT")])
     (tmp_path / "fe.inp").write_text("*INCLUDE, INPUT=nodes.inp\n" + FLAT[FLAT.index("*ELEMENT") :])
     (tmp_path / "scene.toml").write_text('[mesh]\nfe = "fe.inp"\nunit = "mm"\nstress_unit = "MPa"\n')
@@ -449,23 +447,23 @@ def test_a_changed_include_builds_the_model_anew(tmp_path):
     assert out().endswith("built")
 
 
-# ------------------------------------------------------------ all together
+# ------------------------------------------------------------ warnings and size
 
 
 def test_a_load_that_is_not_applied_is_a_warning_of_the_result(tmp_path):
-    """Said once before the run, once at its end, by -q too, and at the top of the page."""
+    """Before the run, at its end, with -q, and at the top of the page, once each."""
     (tmp_path / "fe.inp").write_text(FLAT.replace("*END STEP", "*DSLOAD\n top, P, 1.\n*END STEP"))
     (tmp_path / "scene.toml").write_text(
         '[mesh]\nfe = "fe.inp"\nunit = "mm"\nstress_unit = "MPa"\n[solver]\nmethod = "quasi-static"\nload_time = 0.01\n'
     )
-    told = f"{tmp_path / 'fe.inp'}: line 39: *DSLOAD is not applied: loads are not supported"
+    warning = f"{tmp_path / 'fe.inp'}: line 39: *DSLOAD is not applied: loads are not supported"
     done = mpitled("run", tmp_path / "scene.toml", "--out", tmp_path / "out")
-    assert [line for line in done.stderr.splitlines() if "DSLOAD" in line] == [f"warning: {told}"]
-    assert [line.strip() for line in done.stdout.splitlines() if "DSLOAD" in line] == [f"warning: {told}"]
+    assert [line for line in done.stderr.splitlines() if "DSLOAD" in line] == [f"warning: {warning}"]
+    assert [line.strip() for line in done.stdout.splitlines() if "DSLOAD" in line] == [f"warning: {warning}"]
     report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert report["warnings"] == [told]
+    assert report["warnings"] == [warning]
     quietly = mpitled("run", tmp_path / "scene.toml", "-q", "--out", tmp_path / "out").stderr
-    assert quietly == f"mpitled: warning: {told}\n"
+    assert quietly == f"mpitled: warning: {warning}\n"
     mpitled("report", tmp_path / "out", "--html")
     top, _, below = (tmp_path / "out" / "report.html").read_text().partition("<h2>")
     assert "DSLOAD" in top

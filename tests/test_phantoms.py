@@ -1,4 +1,4 @@
-"""Cylinders and ellipsoids: exact surfaces, sets, volumes that converge, good cells, and balance of constant stress."""
+"""Cylinders, ellipsoids and fitted blocks: surfaces, sets, convergent volumes, cell quality, and the patch test."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from conftest import ROOT
 
 from mpitled import deck, kernels
 from mpitled.cells import hexahedra
-from mpitled.cells import support_domains as support
 from mpitled.errors import InputError
 from mpitled.mesh import Rotation
 from mpitled.meshing import o_grid
@@ -20,7 +19,7 @@ from mpitled.model import loading
 
 CLOUD = deck.Cloud()
 TUMOUR = deck.Tumour(centre=(0.015, 0.0, 0.008), volume=523.6e-9)
-#: Its surface has as few nodes as the ellipsoid's.
+#: Its surface has no more nodes than the ellipsoid's.
 COARSE_SEED = deck.Tumour(centre=(0.015, 0.0, 0.008), volume=523.6e-9, surface_nodes=12)
 RADIUS, HEIGHT, AXES = 0.05, 0.1, np.array([0.08, 0.065, 0.06])
 SEED_VOLUME = 4 / 3 * np.pi * 0.002**3
@@ -50,7 +49,7 @@ def fe_volume(mesh):
     ids=["cylinder", "ellipsoid", "cavity"],
 )
 def test_volumes_converge_at_second_order(mesher, sizes, exact):
-    """The sizes are such that all numbers of elements double: a quarter of the error, and terms of fourth order."""
+    """All numbers of elements double, so the error is a quarter, except for terms of fourth order."""
     coarse, fine = (mesher(size) for size in sizes)
     assert len(fine.node_sets["surface"]) - 2 == pytest.approx(4 * (len(coarse.node_sets["surface"]) - 2), rel=0.1)
     errors = [1 - fe_volume(mesh) / exact for mesh in (coarse, fine)]
@@ -59,8 +58,8 @@ def test_volumes_converge_at_second_order(mesher, sizes, exact):
 
 
 @pytest.mark.parametrize(("mesher", "centre"), [(cylinder, (0.1, 0.0, 0.05)), (ellipsoid, (0.0, 0.0, 0.11))])
-def test_a_tumour_far_outside_is_said_to_be_outside(mesher, centre):
-    """50 mm from the body: no radius of the cloud is the remedy."""
+def test_a_tumour_outside_the_body_is_refused(mesher, centre):
+    """50 mm outside, where another radius of the cloud does not help."""
     with pytest.raises(InputError, match=r"^tumour.centre = .* outside the body, 50(\.\d)? mm from it; move it inside"):
         mesher(tumour=TUMOUR.model_copy(update={"centre": centre}), cloud="core")
 
@@ -79,7 +78,7 @@ def test_cylinder_has_its_nodes_on_its_surface():
 
 @pytest.mark.parametrize("tumour", [None, TUMOUR], ids=["whole", "cavity"])
 def test_ellipsoid_has_its_nodes_on_its_surface(tumour):
-    """patch and fixed by the mesher's formulas; their edges are at nodes, so that a tolerance changes nothing."""
+    """The sets patch and fixed end at nodes, so a tolerance in their definition changes nothing."""
     mesh = ellipsoid(tumour=tumour)
     p, q, r = (mesh.points / AXES).T
     surface = np.flatnonzero(np.abs(p * p + q * q + r * r - 1) < ROUND_OFF)
@@ -100,8 +99,8 @@ def test_ellipsoid_has_its_nodes_on_its_surface(tumour):
 
 
 @pytest.mark.parametrize("size", [0.02, 0.012, 0.008, 0.005])
-def test_no_corner_is_poor(size):
-    """Scaled Jacobians: 0.5 in the shapes of the validation, 0.3 in an ellipsoid as flat as a lens."""
+def test_scaled_jacobians_are_good(size):
+    """At least 0.5 in the shapes of the validation, and 0.3 in a flat or long ellipsoid."""
     lens, cigar = ellipsoid(size, axes=[0.08, 0.08, 0.03]), ellipsoid(size, axes=[0.08, 0.04, 0.04])
     for mesh in (lens, cigar):
         assert hexahedra.scaled_jacobian(mesh.points, mesh.hexahedra).min() > 0.3
@@ -110,16 +109,16 @@ def test_no_corner_is_poor(size):
 
 
 @pytest.mark.parametrize("size", [0.008, 0.005, 0.003])
-def test_elements_have_the_size_asked_for(size):
-    """In the mean within 10 %; edges of the smallest and the largest cell differ by less than a factor of 2."""
+def test_elements_have_the_requested_size(size):
+    """The mean within 10 %, and the largest edge less than twice the smallest."""
     for mesh in (cylinder(size, grading=1.0), ellipsoid(size)):
         edges = np.cbrt(hexahedra.volumes(mesh.points, mesh.hexahedra))
         assert np.cbrt((edges**3).mean()) == pytest.approx(size, rel=0.1)
         assert edges.max() < 2 * edges.min()
 
 
-def test_graded_elements_are_thin_where_surfaces_change():
-    """As many as without grading; volume, sets and their edges stay; the thinnest layer has the share asked for."""
+def test_graded_elements_are_thin_at_the_surface():
+    """Number of elements and sets are those without grading; the thinnest layer has the requested share."""
     ball = 4 / 3 * np.pi * AXES.prod()
     for mesher, name, exact in ((cylinder, "bottom", np.pi * RADIUS**2 * HEIGHT), (ellipsoid, "patch", ball)):
         even, fine = mesher(0.005, grading=1.0), mesher(0.005, grading=0.25)
@@ -132,7 +131,7 @@ def test_graded_elements_are_thin_where_surfaces_change():
         assert hexahedra.scaled_jacobian(fine.points, fine.hexahedra).min() > 0.4
     layers = np.diff(np.unique(cylinder(0.005, grading=0.25).points[:, 2])) / 0.005
     assert layers[0] == pytest.approx(layers[-1]) == layers.min()
-    # The map's slope at its end is the share; half a layer inwards it is more by the second order.
+    # The slope of the map is the share at the end, and differs by a term of second order half a layer inwards.
     for n in (20, 40):
         thinnest = n * (1 - o_grid.graded(n, 0.25)[-2])
         assert thinnest - 0.25 == pytest.approx(0.75 * np.pi**2 / 6 / n**2, rel=0.01)
@@ -140,7 +139,7 @@ def test_graded_elements_are_thin_where_surfaces_change():
 
 @pytest.mark.parametrize("where", ["corner", "middle", "face"])
 def test_block_is_fitted_to_a_sphere(where):
-    """Its hull converges to the ball at second order, the faces stay whole, and cells are sound on both sides."""
+    """The volume of the ball converges at second order, and cells are valid on both sides of the sphere."""
     centre = {"corner": (0.0, 0.0, 0.0), "middle": (0.015, 0.014, 0.016), "face": (0.015, 0.015, 0.03)}[where]
     ball = 4 / 3 * np.pi * 0.008**3 / {"corner": 8, "middle": 1, "face": 2}[where]
     sphere = deck.Sphere(name="cyst", centre=centre, radius=0.008)
@@ -160,25 +159,25 @@ def test_block_is_fitted_to_a_sphere(where):
 
 
 def test_sphere_of_cells(tmp_path):
-    """By middles of hexahedra, replaced ones for the cloud; what cannot be is said by its key."""
+    """A cell is in the sphere if the midpoint of its hexahedron, remaining or replaced, is in the sphere."""
     path = tmp_path / "scene.toml"
     text = '[block]\nsize = [40, 40, 40]\nelements = [8, 8, 8]\ncloud = "core"\n[[fixed]]\nnodes = "x0"\n' + MATERIAL
     cyst = "[sphere.cyst]\ncentre = [12, 20, 20]\nradius = 10\n"
     cyst += '[material.fluid]\nyoungs_modulus = 10\npoissons_ratio = 0.1\ncells = ["cyst"]\n'
     path.write_text(text + cyst)
     mesh, model = (of(deck.load_deck(path)) for of in (model_build.read_mesh, model_build.build))
-    places = np.concatenate([mesh.points[mesh.hexahedra].mean(axis=1), mesh.integration_points])
-    middles = 0.005 * (np.floor(places / 0.005) + 0.5)
-    inside = np.linalg.norm(middles - [0.012, 0.02, 0.02], axis=1) <= 0.01
-    assert 0 < inside[: len(mesh.hexahedra)].sum() < inside.sum() < len(middles)
+    positions = np.concatenate([mesh.points[mesh.hexahedra].mean(axis=1), mesh.integration_points])
+    midpoints = 0.005 * (np.floor(positions / 0.005) + 0.5)
+    inside = np.linalg.norm(midpoints - [0.012, 0.02, 0.02], axis=1) <= 0.01
+    assert 0 < inside[: len(mesh.hexahedra)].sum() < inside.sum() < len(midpoints)
     np.testing.assert_array_equal(np.flatnonzero(inside), mesh.cell_sets["cyst"])
     np.testing.assert_array_equal([model.materials[m].name for m in model.material], np.where(inside, "fluid", "brain"))
-    # A sphere of no other material divides nothing, and takes each integration point by itself.
+    # A sphere without a separate material does not divide the cloud; each integration point counts by its position.
     path.write_text(text + cyst.partition("[material")[0])
     undivided = model_build.read_mesh(deck.load_deck(path))
     assert len(undivided.parts) == 1 < len(mesh.parts)
-    places = np.concatenate([undivided.points[undivided.hexahedra].mean(axis=1), undivided.integration_points])
-    inside = np.linalg.norm(places - [0.012, 0.02, 0.02], axis=1) <= 0.01
+    positions = np.concatenate([undivided.points[undivided.hexahedra].mean(axis=1), undivided.integration_points])
+    inside = np.linalg.norm(positions - [0.012, 0.02, 0.02], axis=1) <= 0.01
     np.testing.assert_array_equal(np.flatnonzero(inside), undivided.cell_sets["cyst"])
     for before, after, message in (
         ("radius = 10", "radius = 0.1", r"sphere.cyst: no cell has its middle in it"),
@@ -194,7 +193,7 @@ def test_sphere_of_cells(tmp_path):
 
 @pytest.mark.parametrize("tumour", [None, TUMOUR], ids=["whole", "tumour"])
 @pytest.mark.parametrize("cloud", ["core", "all"])
-def test_cloud_takes_the_place_of_hexahedra(cloud, tumour):
+def test_cloud_replaces_hexahedra(cloud, tumour):
     for mesher in (cylinder, ellipsoid):
         seed = tumour and deck.Tumour(centre=(0.005, 0.0, 0.05 if mesher is cylinder else 0.008), volume=523.6e-9)
         whole, mesh = mesher(0.007, grading=1.0), mesher(0.007, cloud=cloud, tumour=seed, grading=1.0)
@@ -204,26 +203,26 @@ def test_cloud_takes_the_place_of_hexahedra(cloud, tumour):
         assert (mesh.n_fe_nodes > 0) == (cloud == "core")
         assert (len(mesh.node_sets["interface"]) > 0) == (cloud == "core")
         for name, nodes in whole.node_sets.items():
-            places = {tuple(place) for place in mesh.points[mesh.node_sets[name]]}
-            assert places == {tuple(place) for place in whole.points[nodes]}
+            positions = {tuple(position) for position in mesh.points[mesh.node_sets[name]]}
+            assert positions == {tuple(position) for position in whole.points[nodes]}
 
 
 def test_core_ends_at_its_share_of_the_radius():
-    """The square core alone at a share of 0.5; with more, also rings, but never the outermost."""
+    """At a share of 0.5 the square core only; at larger shares also rings, without the outermost ring."""
     for share, reach in ((0.5, 0.5), (0.7, 0.7), (0.999, 0.8)):
         mesh = cylinder(0.005, cloud="core", core_share=share, grading=1.0)
-        places = mesh.points[mesh.node_sets["interface"]]
-        r = np.hypot(*places[:, :2].T).max() / RADIUS
+        positions = mesh.points[mesh.node_sets["interface"]]
+        r = np.hypot(*positions[:, :2].T).max() / RADIUS
         assert r == pytest.approx(reach, abs=0.13)
         assert r < 0.95
         margin = max(round((1 - share) / 2 * 20), 1) * 0.005
-        assert (places[:, 2].min(), places[:, 2].max()) == pytest.approx((margin, HEIGHT - margin))
+        assert (positions[:, 2].min(), positions[:, 2].max()) == pytest.approx((margin, HEIGHT - margin))
 
 
 @pytest.mark.parametrize("shape", ["cylinder", "ellipsoid"])
 @pytest.mark.parametrize("cloud", ["none", "core"])
 def test_constant_stress_is_in_balance_at_inner_nodes(tmp_path, shape, cloud):
-    """The patch test: gradients of affine fields are exact in every cell, and their forces vanish inside."""
+    """The patch test: gradients of affine fields are exact in each cell, and inner nodal forces are zero."""
     geometry = {
         "cylinder": "[cylinder]\nradius = 50\nheight = 100\nelement_size = 12.0\n",
         "ellipsoid": "[ellipsoid]\nsemi_axes = [80, 65, 60]\nelement_size = 12.0\n",
@@ -236,18 +235,18 @@ def test_constant_stress_is_in_balance_at_inner_nodes(tmp_path, shape, cloud):
         assert len(model.domains) > 0
     for cells, gradients in ((model.hexahedra, B), (model.domains, model.domain_gradients)):
         slopes = np.einsum("nai,naj->nij", model.points[cells], gradients)
-        # Round-off, times the root of the worst condition of a moment matrix that is accepted.
+        # Round-off times the root of the largest accepted condition of a moment matrix.
         assert np.abs(slopes - np.eye(3)).max(initial=0) < 1e-12
-    forces = support.nodal_sum(model.hexahedra, V[:, None, None] * B, model.n_nodes)
+    forces = hexahedra.nodal_sum(model.hexahedra, V[:, None, None] * B, model.n_nodes)
     if cloud == "core":
         of_cloud = model.domain_volumes[:, None, None] * model.domain_gradients
-        forces += support.nodal_sum(model.domains, of_cloud, model.n_nodes)
+        forces += hexahedra.nodal_sum(model.domains, of_cloud, model.n_nodes)
     inner = np.setdiff1d(np.arange(model.n_nodes), model.node_sets["surface"])
     assert np.abs(forces[inner]).max() < 1e-11 * np.abs(forces).max()
 
 
 def test_a_hexahedron_is_the_seed_of_the_papers_mesh():
-    """It has its middle in the tumour's centre, the surface is where it was, and no other node has come too near."""
+    """Its middle is the tumour's centre, the surface does not move, and the other cells stay valid."""
     whole, mesh = ellipsoid(), ellipsoid(tumour=TUMOUR, cavity="moved")
     seed = mesh.points[mesh.node_sets["tumour"]]
     assert len(mesh.hexahedra) == len(whole.hexahedra) - 1
@@ -259,7 +258,7 @@ def test_a_hexahedron_is_the_seed_of_the_papers_mesh():
 
 
 def test_nodes_beside_the_seed_move_as_incompressible_tissue():
-    """To R from the seed; from elsewhere so that every shell keeps its volume, whichever way it lies."""
+    """Nodes on the seed move to R; other nodes move so that each shell keeps its volume."""
     rng, centre, volume = np.random.default_rng(1), np.array(TUMOUR.centre), 523.6e-9
     direction = rng.normal(size=(200, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -272,7 +271,7 @@ def test_nodes_beside_the_seed_move_as_incompressible_tissue():
     np.testing.assert_allclose(after[1::2], loading.sphere_radius(volume), rtol=1e-12)
 
 
-def test_a_seed_needs_room():
+def test_a_seed_that_does_not_fit_is_refused():
     with pytest.raises(InputError, match=r"tumour.centre = \(75, 0, 8\) mm: the seed and an element's size"):
         ellipsoid(tumour=deck.Tumour(centre=(0.075, 0.0, 0.008), volume=523.6e-9))
     with pytest.raises(InputError, match=r'cylinder.cloud = "none"'):
@@ -280,24 +279,24 @@ def test_a_seed_needs_room():
 
 
 @pytest.mark.parametrize("degrees", [90.0, 180.0])
-def test_turned_nodes_keep_to_their_arcs(degrees):
-    """At any share of the load a turned node is as far from the axis as ever, at that share of the angle."""
+def test_rotated_nodes_move_on_arcs(degrees):
+    """At any share of the load the distance to the axis is constant, and the angle has that share."""
     rng = np.random.default_rng(0)
     points, centre = rng.uniform(-1, 1, (50, 3)), np.array([0.3, -0.2, 0.9])
     for axis in range(3):
         rotation = Rotation(np.radians(degrees), axis, tuple(centre))
         full, turns = loading.rotation_path(points, rotation)
         path, share = np.empty(full.size), 0.37
-        kernels.follow(path, full.ravel(), turns.reshape(-1, 3), share)
+        kernels.rotate_prescribed(path, full.ravel(), turns.reshape(-1, 3), share)
         across = [(axis + 1) % 3, (axis + 2) % 3]
         before, after = ((p - centre)[:, across] @ [1, 1j] for p in (points, points + path.reshape(-1, 3)))
         np.testing.assert_allclose(after, before * np.exp(1j * share * rotation.angle), atol=1e-14)
-        kernels.follow(path, full.ravel(), turns.reshape(-1, 3), 1.0)
+        kernels.rotate_prescribed(path, full.ravel(), turns.reshape(-1, 3), 1.0)
         np.testing.assert_allclose(path, full.ravel(), rtol=0, atol=1e-15)
 
 
 def test_rotation_in_the_deck(tmp_path):
-    """Degrees and millimetres, beside a displacement; a direction across the axis must not be free."""
+    """In degrees, added to a displacement in millimetres; directions normal to the axis must be prescribed."""
     path = tmp_path / "scene.toml"
     text = "[block]\ncorner = [-10, -10, 0]\nsize = [20, 20, 40]\nelements = [2, 2, 4]\n" + MATERIAL
     text += '[[fixed]]\nnodes = "z0"\n[[displaced]]\nnodes = "z1"\ndisplacement = [0, 0, 4]\nrotation = 90\n'

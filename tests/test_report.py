@@ -181,18 +181,18 @@ def test_volume_balance_of_an_incompressible_swelling(tmp_path):
         model = model_of(tmp_path, GROWTH, elements=elements, cloud="core")
         centre, radii = np.array([24e-3, 20e-3, 20e-3]), (2e-3, 3e-3)
         tumour = {"centre_m": list(centre), "seed_radius_m": radii[0], "radius_m": radii[1]}
-        outcome = state_of(model, swell(centre, *radii), tumour)
-        made = computed(outcome)
+        state = state_of(model, swell(centre, *radii), tumour)
+        made = computed(state)
         balance, sphere = made["volume_balance"], 4 / 3 * np.pi * 1e9
         assert made["tumour_volume_mm3"] == pytest.approx(sphere * radii[1] ** 3, rel=1e-12)
         assert balance["tumour_added_mm3"] == pytest.approx(sphere * (radii[1] ** 3 - radii[0] ** 3), rel=1e-12)
         assert balance["elastic_compression_mm3"] == 0
         errors.append(balance["relative_error"])
         # Of a surface that is not round, half of it at rest: the mean of the cubes.
-        field = outcome.field.copy()
-        field[outcome.seed[::2]] = 0
-        cubes = np.where(np.arange(len(outcome.seed)) % 2, radii[1] ** 3, radii[0] ** 3)
-        by_field = report.compute(replace(outcome, field=field))["tumour_volume_by_field_mm3"]
+        field = state.field.copy()
+        field[state.seed[::2]] = 0
+        cubes = np.where(np.arange(len(state.seed)) % 2, radii[1] ** 3, radii[0] ** 3)
+        by_field = computed(replace(state, field=field))["tumour_volume_by_field_mm3"]
         assert by_field == pytest.approx(sphere * cubes.mean(), rel=1e-12)
         # The first ring is about a spacing wide there, and the next node moves less than the surface's 1 mm.
         assert 0.2 < made["max_displacement_outside_first_ring_mm"] < 0.95
@@ -207,8 +207,8 @@ def test_volume_that_is_lost_is_told_from_volume_that_is_gained(tmp_path, share,
     model = model_of(tmp_path, GROWTH, elements="12, 10, 10", cloud="core")
     centre, radii = np.array([24e-3, 20e-3, 20e-3]), (2e-3, 3e-3)
     tumour = {"centre_m": list(centre), "seed_radius_m": radii[0], "radius_m": radii[1]}
-    outcome = state_of(model, swell(centre, *radii), tumour)
-    made = report.compute(replace(outcome, field=share * outcome.field))
+    state = state_of(model, swell(centre, *radii), tumour)
+    made = report.compute(replace(state, field=share * state.field))
     assert made.volume_error == pytest.approx(0.2, abs=0.02)
     assert (made.volume_unaccounted_mm3 > 0) == (share < 1)
     assert any(words in warning for warning in made.warnings)
@@ -222,10 +222,10 @@ def test_the_first_ring_has_every_cell_with_a_node_of_the_tumour(tmp_path):
     ring_domains = np.isin(model.domains, seed).any(axis=1)
     ring = np.union1d(fe_ring, model.domains[ring_domains])
     assert len(np.setdiff1d(fe_ring, model.domains[ring_domains]))
-    outcome = outcome_of(replace(model, node_sets=model.node_sets | {"tumour": seed}), lambda X: 0 * X)
-    outcome.field[ring] = outcome.domain_displacement[ring_domains] = 1.0
-    outcome.field[np.setdiff1d(np.arange(model.n_nodes), ring)[0], 1] = 2e-3
-    assert report.compute(outcome)["max_displacement_outside_first_ring_mm"] == pytest.approx(2.0, rel=1e-12)
+    state = state_of(replace(model, node_sets=model.node_sets | {"tumour": seed}), lambda X: 0 * X)
+    state.field[ring] = state.domain_displacement[ring_domains] = 1.0
+    state.field[np.setdiff1d(np.arange(model.n_nodes), ring)[0], 1] = 2e-3
+    assert computed(state)["max_displacement_outside_first_ring_mm"] == pytest.approx(2.0, rel=1e-12)
 
 
 def test_volume_is_balanced_only_where_the_interface_is_closed_or_its_rim_at_rest(tmp_path):
@@ -235,10 +235,10 @@ def test_volume_is_balanced_only_where_the_interface_is_closed_or_its_rim_at_res
     model = replace(model, node_sets=model.node_sets | {"interface": interface[1:]})
     centre = np.array([24e-3, 20e-3, 20e-3])
     tumour = {"centre_m": list(centre), "seed_radius_m": 2e-3, "radius_m": 3e-3}
-    outcome = outcome_of(model, swell(centre, 2e-3, 3e-3), tumour)
-    assert "volume_balance" not in report.compute(outcome)
-    outcome.field[model.hexahedra[(model.hexahedra == interface[0]).any(axis=1)]] = 0
-    assert "volume_balance" in report.compute(outcome)
+    state = state_of(model, swell(centre, 2e-3, 3e-3), tumour)
+    assert "volume_balance" not in computed(state)
+    state.field[model.hexahedra[(model.hexahedra == interface[0]).any(axis=1)]] = 0
+    assert "volume_balance" in computed(state)
 
 
 def test_enclosed_volume_is_that_of_the_hexahedra():
@@ -448,7 +448,7 @@ def test_info_knows_the_files_around_a_run(tmp_path):
         "a.k": f"is a mesh: mpitled check {tmp_path / 'a.k'}",
         "report.json": f"is the report of a run: mpitled report {tmp_path}",
         "a.csv": "is a table of text; open it in an editor or a spreadsheet",
-        "a.png": "is there to be looked at; open it in a viewer or a browser",
+        "a.png": "is a picture or a page; open it in a viewer or a browser",
     }.items():
         (tmp_path / name).write_text("anything")
         assert complaint(mpitled("info", tmp_path / name, status=2)) == f"mpitled: {tmp_path / name}: {words}"

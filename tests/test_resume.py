@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import h5py
@@ -15,7 +14,6 @@ from conftest import ranks
 from faults import inject
 from hypothesis import given
 from hypothesis import strategies as st
-from mpitled.solver.restart import Kept, Packed, unpack
 from scenes import MIXED, pulled
 
 from mpitled import checksum, cli, job, store
@@ -111,18 +109,6 @@ def stopped(tmp_path, monkeypatch) -> tuple[Path, Path]:
     run(deck, folder, monkeypatch, 3)
     run(deck, folder, monkeypatch, 3, resume=True)
     return deck, folder
-
-
-@pytest.mark.parametrize("ranks", [1, 2, 3])
-def test_numbers_of_each_rank_are_shared_out_anew(ranks):
-    """A checkpoint of two ranks on so many: the first has all of a sum, every one the least of a minimum."""
-    parts = [("run", None, Kept(sums=("work",), least=("jacobian",)))]
-    table = {"run.work": np.array([3.0, 4.0]), "run.jacobian": np.array([0.7, 0.2])}
-    for part in range(ranks):
-        sub = SimpleNamespace(rows=SimpleNamespace(n_parts=ranks, part=part))
-        memory = unpack(parts, Packed({}, {}, {}), table, sub)
-        same = {"run.work": table["run.work"][part % 2], "run.jacobian": table["run.jacobian"][part % 2]}
-        assert memory == (same if ranks == 2 else {"run.work": 7.0 * (part == 0), "run.jacobian": 0.2})
 
 
 def test_another_run_is_refused(stopped, monkeypatch):
@@ -241,7 +227,7 @@ def test_nobody_computes_with_what_is_damaged(stopped, monkeypatch, capsys):
     out = ["--out", str(folder / "made")]
     for path, array, commands in (
         (model, "points", (["report"], ["compare", str(folder)], ["export", "--abaqus", *out], ["partition", "2"])),
-        (model, "blocks/0/nodes", (["report"], ["partition", "2"], ["predict", "--parts", "2", *out])),
+        (model, "blocks/0/nodes", (["report"], ["partition", "2"])),
         (result, "VTKHDF/PointData/displacement", (["report"], ["compare", str(folder)])),
         (result, "VTKHDF/FieldData/strain_energy", (["report", "--html"],)),
     ):

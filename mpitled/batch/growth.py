@@ -70,7 +70,7 @@ def _write_report(case: Case, run: Case, outcome: FinalState) -> str:
 
         field = interpolate("displacement", frames, result.at_nodes)
         coarse = interpolate("displacement", (first, first + 2), result.at_nodes)
-        error = 1e3 * float(np.linalg.norm(field - coarse, axis=1).max()) / 3
+        error = 1e3 * float(np.linalg.norm(field - coarse, axis=1).max() / 3)
         jacobian = interpolate("J", frames, result.in_cells)
         of_run = outcome.figures
         figures: dict[str, Any] = {name: of_run[name] for name in ("ranks", "nodes", "cells") if name in of_run}

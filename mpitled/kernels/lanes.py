@@ -144,8 +144,11 @@ def _in_lanes(builder: Any, number: Any, lanes: Any) -> Any:
     return builder.shuffle_vector(single, ir.Constant(lanes, ir.Undefined), order)
 
 
-def _arithmetic(function: Any, instruction: str) -> None:
-    """An operator on two vectors, or on one and a number, which takes the type of the vector's numbers."""
+def _elementwise(function: Any, combine: Callable[[Any, Any, Any], Any]) -> None:
+    """A function of two vectors, or of one and a number, which takes the type of the vector's numbers.
+
+    combine: (builder, a, b) -> the LLVM value of two vectors.
+    """
 
     def result(a: types.Type, b: types.Type) -> types.Type | None:
         if isinstance(a, Lanes):
@@ -158,7 +161,7 @@ def _arithmetic(function: Any, instruction: str) -> None:
             x if isinstance(t, Lanes) else _in_lanes(builder, context.cast(builder, x, t, number), lanes)
             for x, t in zip(args, sig.args, strict=True)
         )
-        return getattr(builder, instruction)(a, b, flags=_FLAGS)
+        return combine(builder, a, b)
 
     _typed(function, result)
     numbers = (types.Float, types.Integer)
@@ -166,13 +169,12 @@ def _arithmetic(function: Any, instruction: str) -> None:
         lower_builtin(function, *pair)(lower)
 
 
-for _function, _instruction in (
-    (operator.add, "fadd"),
-    (operator.sub, "fsub"),
-    (operator.mul, "fmul"),
-    (operator.truediv, "fdiv"),
-):
-    _arithmetic(_function, _instruction)
+_elementwise(operator.add, lambda builder, a, b: builder.fadd(a, b, flags=_FLAGS))
+_elementwise(operator.sub, lambda builder, a, b: builder.fsub(a, b, flags=_FLAGS))
+_elementwise(operator.mul, lambda builder, a, b: builder.fmul(a, b, flags=_FLAGS))
+_elementwise(operator.truediv, lambda builder, a, b: builder.fdiv(a, b, flags=_FLAGS))
+# The first number if one of them is NaN, as in `minimum`.
+_elementwise(np.maximum, lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), b, a))
 
 
 def _of(row: types.Type) -> Lanes | None:

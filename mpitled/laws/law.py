@@ -19,8 +19,8 @@ class Law(BaseModel):
     """A hyperelastic law with its parameters, in SI units.
 
     A law is a strain energy density W(F), Pa, of the deformation gradient F. The static methods are its formulas. They
-    are written with the operators of numbers and with `np.sqrt`, `np.log` and `np.abs` alone: the kernels compile the
-    same functions for vectors of cells. They take
+    are written with the operators of numbers and with `np.sqrt`, `np.log`, `np.abs` and `np.maximum` alone: the kernels
+    compile the same functions for vectors of cells. They take
 
     - `F`, the deformation gradient, and `H` = F - I, the displacement gradient, by rows (`Tensor`);
     - `K` = J F^-T, the cofactor of F, by rows, and `J` = det F;
@@ -67,7 +67,7 @@ class Law(BaseModel):
 
     @staticmethod
     def tangent_bound(F: Tensor, K: Tensor, J: Any, c: Any) -> tuple[Any, Any]:
-        """Numbers a, b with D2W[G, G] <= a (K:G)^2 + b G:G for every increment G of F.
+        """Numbers a, b >= 0 with D2W[G, G] <= a (K:G)^2 + b G:G for every increment G of F.
 
         The stable time step rests on these: a cell's largest eigenvalue is at most V (a |B K^T|^2 + b |B|^2), with its
         volume V and its gradients B.

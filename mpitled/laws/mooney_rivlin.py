@@ -94,4 +94,4 @@ class MooneyRivlin(Law):
         square = a * a + b * b + d * d + e * e + f * f + g * g + h * h + i * i + j * j
         of_cofactor = A * A + B * B + D * D + E * E + G * G + H * H + L * L + M * M + N * N
         bound = c10 * 2 + c01 * (square * 4 + np.sqrt(of_cofactor * 8)) + np.abs(q) * np.sqrt(square * 2)
-        return lam + s / (J * J), bound
+        return np.maximum(lam + s / (J * J), 0), bound

@@ -58,13 +58,13 @@ class NeoHookean(Law):
 
     @staticmethod
     def tangent_bound(F: Tensor, K: Tensor, J: Any, c: Any) -> tuple[Any, Any]:
-        """a = lambda + mu / J^2; b = mu + |q| sqrt(2) |F| with q = lambda (J - 1) - mu / J.
+        """a = lambda + mu / J^2, or 0; b = mu + |q| sqrt(2) |F| with q = lambda (J - 1) - mu / J.
 
         The tangent is mu I + (lambda + mu / J^2) K (x) K + q dK/dF. The last operator maps G to F x G, the tensor cross
-        product, whose norm is at most sqrt(2) |F| |G|.
+        product, whose norm is at most sqrt(2) |F| |G|. lambda + mu / J^2 is negative where nu < 0 and J is large.
         """
         mu, lam = c
         a, b, d, e, f, g, h, i, j = F
         q = lam * (J - 1) - mu / J
         square = a * a + b * b + d * d + e * e + f * f + g * g + h * h + i * i + j * j
-        return lam + mu / (J * J), mu + np.abs(q) * np.sqrt(square * 2)
+        return np.maximum(lam + mu / (J * J), 0), mu + np.abs(q) * np.sqrt(square * 2)

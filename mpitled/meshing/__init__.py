@@ -1,1 +1,1 @@
-"""Geometry made here: hexahedra from label images and shapes, and the mesh-free cloud."""
+"""Mesh generation: hexahedra from label images and shapes, and the mesh-free cloud."""

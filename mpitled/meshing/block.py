@@ -1,4 +1,4 @@
-"""Blocks of hexahedra, regular or fitted to a sphere, with a cloud in their core, a cloud only, or no cloud."""
+"""Blocks: regular hexahedra or hexahedra fitted to a sphere, with a cloud in the core or everywhere, or without one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mpitled.meshing.placement import format_position
 if TYPE_CHECKING:
     from mpitled import deck
 
-# A centre within this share of the block's size from a face lies in the face.
+# A centre that is nearer to a face than this share of the block's size lies in the face.
 _NEAR = 1e-9
 
 
@@ -27,17 +27,17 @@ def block_mesh(
     fitted: deck.Sphere | None = None,
     spheres: Sequence[deck.Sphere] = (),
 ) -> Mesh:
-    """The mesh of a block with its faces as node sets x0, x1, y0, y1, z0, z1 and, together, surface.
+    """The mesh of a block. The node sets x0, x1, y0, y1, z0, z1 are its faces, and surface is all of them.
 
-    A core cloud replaces about `core_share` of the hexahedra along each side, in the middle or around the sphere to
-    which they are fitted. With a tumour it replaces those within `cloud.radius` of the tumour's centre. `spheres`
-    divide the cloud in parts. InputError for a tumour without a cloud, and for a tumour or sphere without room.
+    A core cloud replaces about `core_share` of the hexahedra along each side, in the middle or around the fitted
+    sphere. With a tumour, a core cloud replaces the hexahedra within `cloud.radius` of the tumour's centre. `spheres`
+    divide the cloud into parts. InputError if a tumour has no cloud, or if a tumour or sphere does not fit.
     """
     if tumour is not None and block.cloud == "none":
         raise InputError('block.cloud = "none": a tumour grows in a cloud; set it to "core" or "all"')
     corner, size, shape = np.asarray(block.corner), np.asarray(block.size, float), np.asarray(block.elements, np.int64)
     if block.cloud == "all" and cloud.spacing:
-        # The cloud has the boundary nodes of the elements that it replaces, so the elements follow its spacing.
+        # The boundary nodes of the replaced elements remain in the cloud, so the elements follow its spacing.
         wanted = np.maximum(np.rint(size / cloud.spacing), 1)
         check_size(float(wanted.prod()), "cloud.spacing")
         shape = wanted.astype(np.int64)
@@ -57,7 +57,7 @@ def block_mesh(
         return hexahedral_mesh(corner + local, hexahedra, node_sets)
     if block.cloud == "all":
         if not fitted:
-            # Nodes move along faces and edges only: no node leaves a face, no corner moves, and the volume is the same.
+            # Nodes move along faces and edges only, so the volume does not change.
             free = ~(on_face[0] | on_face[1])[surface]
             shift = np.random.default_rng([cloud.seed, 2]).uniform(-0.5, 0.5, free.shape) * cloud.irregularity
             local[surface] += np.where(free, shift * size / shape, 0.0)
@@ -76,26 +76,26 @@ def _inner(shape: Ints, share: float) -> Bools:
 
 
 def _fitted(size: Floats, shape: Ints, centre: Floats, sphere: deck.Sphere, share: float) -> tuple[Floats, Ints, Bools]:
-    """Nodes (n, 3) in the block [0, size], hexahedra (m, 8), and which of them lie in the core.
+    """Nodes (n, 3), m, in the block [0, size], hexahedra (m, 8), and a mask (m,) of the core.
 
-    The ball is an O-grid. Layers from the ball to the faces thicken with the distance as the cells widen. The core ends
-    at `share` of the distances to the faces. If the centre lies in a face, the mesh is the part inside the block of a
-    mesh for the block and its mirror image.
+    The ball is an O-grid. Between ball and faces, the thickness of layers grows with the width of their cells. The core
+    ends at `share` of the distances to the faces. If the centre lies in a face, the block and its mirror image are
+    meshed, and the mirror image is removed.
     """
     low_face, high_face = (np.abs(centre - end) < _NEAR * size for end in (0, size))
     centre = np.where(low_face, 0.0, np.where(high_face, size, centre))
     low, high = np.where(high_face | ~low_face, 0.0, -size), np.where(high_face, 2 * size, size)
-    distances, whole = np.minimum(centre - low, high - centre), np.where(low_face | high_face, 2, 1) * shape
+    distances, shape = np.minimum(centre - low, high - centre), np.where(low_face | high_face, 2, 1) * shape
     if (distances <= sphere.radius).any():
         raise InputError(
             f"block.fitted: the sphere {sphere.name} around {format_position(np.asarray(sphere.centre))} does not lie "
             "in the block, with its centre inside or in a face; move it or make it smaller"
         )
-    width = np.pi / 2 * sphere.radius / whole.mean()
-    o_grid = OGrid(tuple(whole), sphere.radius, width)
+    width = np.pi / 2 * sphere.radius / shape.mean()
+    o_grid = OGrid(tuple(shape), sphere.radius, width)
     inner, outer = sphere.radius * o_grid.points, low + (o_grid.cube + 1) / 2 * (high - low) - centre
     start = inner[o_grid.surface]
-    ratio = ((high - low) / whole).mean() / width
+    ratio = ((high - low) / shape).mean() / width
     growth = max(np.log(ratio), _NEAR)
     n = whole_number(np.linalg.norm(outer - start, axis=1).mean() / width * growth / np.expm1(growth))
     along = np.expm1(growth * np.arange(1, n + 1) / n)[:, None, None] / np.expm1(growth)

@@ -12,27 +12,27 @@ from mpitled.cells import hexahedra
 from mpitled.mesh import Bools, Floats, Ints
 from mpitled.meshing.faces import FACES
 
-#: Other programs' orders of a hexahedron's nodes: top and bottom exchanged (or mirrored), along x, then y, then z, and
-#: the latter mirrored. A row gives the nodes of such a hexahedron in Abaqus's order.
+#: Node orders of other programs: top and bottom exchanged (or mirrored), lexicographic, and lexicographic mirrored. A
+#: row gives the nodes of such a hexahedron in Abaqus's order.
 ORDERS = np.array([[4, 5, 6, 7, 0, 1, 2, 3], [0, 1, 3, 2, 4, 5, 7, 6], [4, 5, 7, 6, 0, 1, 3, 2]])
-#: Singular values of the prescribed part of rigid motions below this share of the largest count as zero.
+#: A rigid motion is free if its singular value is below this share of the largest.
 _FREE = 1e-6
-_NEAR = 16  # cells with the nearest centres that are tested for holding a point
+_NEAR = 16  # a point is tested against this number of cells with the nearest centres
 
 
 def reordered(points: Floats, cells: Ints, rows: Ints) -> Ints:
-    """Hexahedra (len(rows), 8) with their nodes in an order that makes them valid; rows of -1 where no order does."""
-    found = np.full((len(rows), 8), -1, np.int64)
+    """Hexahedra (len(rows), 8) with nodes in a valid order; -1 in rows without a valid order."""
+    result = np.full((len(rows), 8), -1, np.int64)
     for order in ORDERS:
-        open_rows = np.flatnonzero(found[:, 0] < 0)
-        trial = cells[rows[open_rows]][:, order]
+        remaining = np.flatnonzero(result[:, 0] < 0)
+        trial = cells[rows[remaining]][:, order]
         valid = hexahedra.scaled_jacobian(points, trial) > 0
-        found[open_rows[valid]] = trial[valid]
-    return found
+        result[remaining[valid]] = trial[valid]
+    return result
 
 
 def coincident(points: Floats, tolerance: float) -> Ints:
-    """Nodes (n,), ascending, that have an earlier node at the same point or within the tolerance, m."""
+    """Nodes (n,), ascending, with an earlier node at the same point or within the tolerance, m."""
     order = np.lexsort(points.T)
     same = (np.diff(points[order], axis=0) == 0).all(axis=1)
     rest = np.sort(order[~np.append(False, same)]) if len(order) else order
@@ -45,8 +45,8 @@ def coincident(points: Floats, tolerance: float) -> Ints:
 
 
 def repeated(cells: Ints) -> tuple[Ints, Ints]:
-    """Rows of cells (n, k) with the same nodes, in any order, as an earlier row, and these earlier rows."""
-    # Sums of hashed numbers (Steele et al. 2014) identify sets of nodes up to a probability of 2^-64.
+    """Rows of cells (n, k) with the same nodes as an earlier row in any order, and these earlier rows."""
+    # Equal sums of hashed numbers (Steele et al. 2014) mean equal nodes, with an error probability of 2^-64.
     sums = np.zeros(len(cells), np.uint64)
     for column in cells.T:
         mixed = column.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
@@ -58,12 +58,12 @@ def repeated(cells: Ints) -> tuple[Ints, Ints]:
 
 
 def pieces(cells: Sequence[Ints], n_nodes: int) -> Ints:
-    """Connected piece (n_nodes,) of each node: 0, 1, ...; -1 without a cell. The nodes of a cell are in one piece."""
+    """Number (n_nodes,) of each node's connected piece, from 0; -1 for a node without a cell."""
     parent = np.arange(n_nodes)
     used = np.zeros(n_nodes, bool)
-    for some in cells:
-        _join(parent, np.ascontiguousarray(some))
-        used[some] = True
+    for block in cells:
+        _join(parent, np.ascontiguousarray(block))
+        used[block] = True
     root = _roots(parent)
     number = np.full(n_nodes, -1)
     number[used] = np.unique(root[used], return_inverse=True)[1]
@@ -99,7 +99,7 @@ def _roots(parent):  # type: ignore[no-untyped-def]
 
 
 def free_rigid_modes(points: Floats, dofs: Ints) -> int:
-    """Number of the six rigid motions (small rotations) that leave all prescribed dofs at rest."""
+    """Number of rigid motions, of six with small rotations, that the prescribed dofs do not prevent."""
     if len(dofs) == 0:
         return 6
     node, direction = np.divmod(dofs, 3)
@@ -119,10 +119,10 @@ def scene_remarks(points: Floats, cells: Ints, domains: Ints, n_fe_nodes: int, d
     """Warnings about the model: separate pieces, free rigid motion, support domains with FE nodes only."""
     piece = pieces([cells, domains], len(points))
     n_pieces = int(piece.max(initial=-1)) + 1
-    found = []
+    remarks = []
     if n_pieces > 1:
         sizes = np.sort(np.bincount(piece[piece >= 0]))[::-1]
-        found.append(
+        remarks.append(
             f"warning: the mesh is in {n_pieces} pieces that share no node, of {', '.join(map(str, sizes[:4]))}"
             f"{' ...' if n_pieces > 4 else ''} nodes"
         )
@@ -132,28 +132,29 @@ def scene_remarks(points: Floats, cells: Ints, domains: Ints, n_fe_nodes: int, d
     node_bounds = np.searchsorted(piece[nodes], np.arange(n_pieces + 1))
     loose = 0
     for i in range(min(n_pieces, 1000)):
-        own = nodes[node_bounds[i] : node_bounds[i + 1]]
-        some = np.sort(dofs[order[bounds[i] : bounds[i + 1]]])
-        local = 3 * np.searchsorted(own, some // 3) + some % 3
-        free = free_rigid_modes(points[own], local)
+        piece_nodes = nodes[node_bounds[i] : node_bounds[i + 1]]
+        piece_dofs = np.sort(dofs[order[bounds[i] : bounds[i + 1]]])
+        local = 3 * np.searchsorted(piece_nodes, piece_dofs // 3) + piece_dofs % 3
+        free = free_rigid_modes(points[piece_nodes], local)
         if free and not loose:
-            where = "the mesh" if n_pieces == 1 else f"a piece of {len(own)} nodes"
-            found.append(f"warning: {where} can move as a rigid body ({free} of 6 motions); fix more directions of it")
+            where = "the mesh" if n_pieces == 1 else f"a piece of {len(piece_nodes)} nodes"
+            remarks.append(
+                f"warning: {where} can move as a rigid body ({free} of 6 motions); fix more directions of it"
+            )
         loose += free > 0
     if loose > 1:
-        found[-1] += f"; so can {loose - 1} more pieces"
-    lonely = np.count_nonzero((domains < n_fe_nodes).all(axis=1))
-    if lonely:
-        found.append(
-            f"warning: {lonely} support domains have FE nodes only; lower support.max_fe_nodes or refine the cloud"
+        remarks[-1] += f"; so can {loose - 1} more pieces"
+    if n_fe_only := np.count_nonzero((domains < n_fe_nodes).all(axis=1)):
+        remarks.append(
+            f"warning: {n_fe_only} support domains have FE nodes only; lower support.max_fe_nodes or refine the cloud"
         )
-    return found
+    return remarks
 
 
 def inside(points: Floats, corners: Floats) -> Bools:
-    """Which points (n, 3) lie inside one of the hexahedra with corners (m, 8, 3); faces are treated as planes.
+    """Mask (n,) of points (n, 3) inside one of the hexahedra with corners (m, 8, 3), with plane faces.
 
-    Corners may coincide, as in a tetrahedron. A point in the plane of a face counts as outside both neighbours: the
+    Corners may coincide, as in a tetrahedron. A point in the plane of a face is outside both neighbours, because the
     planes are moved inwards by a millionth of the cell's size.
     """
     if not len(corners) or not len(points):
@@ -175,7 +176,7 @@ def inside(points: Floats, corners: Floats) -> Bools:
 
 
 def enclosed_volume(points: Floats, faces: Ints) -> float | None:
-    """Volume, m^3, inside a closed surface of quadrilaterals (n, 4) seen from outside; None if it is not closed."""
+    """Volume, m^3, inside quadrilaterals (n, 4), anticlockwise seen from outside; None if they are not closed."""
     edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     if not len(faces) or (np.unique(edges, axis=0, return_counts=True)[1] % 2).any():
         return None

@@ -27,7 +27,7 @@ _REMEDY = "ask for fewer"
 
 
 class CloudMesh(NamedTuple):
-    """The hexahedra that remain with the cloud that replaces the others, and the spacing of the cloud's nodes."""
+    """The mixed mesh of remaining hexahedra and cloud, and the spacing of the cloud's nodes."""
 
     mesh: Mesh
     spacing: Spacing
@@ -43,16 +43,16 @@ def build_cloud(
     element_size: float,
     spheres: Sequence[deck.Sphere] = (),
 ) -> CloudMesh:
-    """Replace the chosen ones (n_hexahedra,) of the hexahedra (n, 8) with nodes `points` (n, 3), m, by a cloud.
+    """Replace hexahedra by a cloud; `replaced` (n_hexahedra,) is a mask of `hexahedra` (n_hexahedra, 8).
 
-    Hexahedra may have any shape: integration cells are cut through their trilinear maps, so the volumes sum exactly to
-    the void's volume less the seed's. Nodes of the outer surface that no remaining hexahedron uses become EFG nodes, so
-    a cloud without hexahedra ends on the given surface. Nodes of faces between replaced hexahedra inside and outside
-    one of the spheres become EFG nodes too: the cloud has two parts there and is as fine as these faces. `element_size`
-    (m) is the largest spacing unless the deck gives one. The same arguments give the same bits. The mesh has the given
-    node sets without the nodes that are gone, and the sets interface and, with a tumour, tumour: the seed's surface.
+    `points` (n, 3), m, are nodes of the hexahedra, which may have any shape. Integration cells are cut through
+    trilinear maps, so the volumes sum exactly to the void's volume less the seed's. Nodes of the void's surface remain:
+    those without a remaining hexahedron become EFG nodes. The spheres divide the cloud into parts. Nodes of faces
+    between two parts become EFG nodes, and the cloud is as fine as these faces. `element_size` (m) is the largest
+    spacing unless the deck gives one. Equal arguments give bit-identical results. The mesh has the given node sets
+    without removed nodes, the set interface and, with a tumour, the set tumour: the seed's surface.
 
-    Raises InputError if nothing is replaced, if no node fits, or if the seed does not lie inside the void.
+    InputError if nothing is replaced, if no node fits, or if the seed does not lie inside the void.
     """
     if not replaced.any():
         if tumour is not None:
@@ -93,11 +93,11 @@ def build_cloud(
     volumes, centroids, part_of_point, figures = _integrate(corners, spacing, cloud.points_per_spacing, cell_rng)
     figures["integration_points_per_efg_node"] = float(len(volumes) / (len(new_points) - n_fe_nodes))
 
-    # The sum of the mean gradients over all hexahedra of a node is the node's share of the outer surface.
+    # Sums of V B over all hexahedra of a node are integrals of N_a n over the outer surface.
     areas = np.zeros((len(new_points), 3))
     areas[: len(kept)] = _surface_areas(points, hexahedra, on_boundary)[kept]
     seed_nodes = len(kept) + np.arange(len(seed))
-    # A seed node belongs to the parts that it touches.
+    # A seed node belongs to the parts of the nearest integration points.
     touched = part_of_point[cKDTree(centroids).query(seed, k=[1, 2, 3, 4])[1]]
     ends = np.cumsum([len(kept) + len(seed), *map(len, inner)])
     parts = []
@@ -127,13 +127,13 @@ def build_cloud(
 
 
 def near_centre(points: Floats, hexahedra: Ints, tumour: deck.Tumour, radius: float) -> Bools:
-    """Hexahedra (n,) with their centre within the radius, m, of the tumour's centre."""
+    """Mask (n,) of hexahedra (n, 8) with their centre within the radius, m, of the tumour's centre."""
     distance = np.linalg.norm(points[hexahedra].mean(axis=1) - np.asarray(tumour.centre), axis=1)
     return np.asarray(distance <= radius)
 
 
 def _seed(cloud: deck.Cloud, tumour: deck.Tumour | None, element_size: float) -> tuple[Floats, Spacing]:
-    """Nodes on the seed's surface and the spacing around it."""
+    """Nodes (n, 3), m, on the seed's surface, and the spacing around the seed."""
     largest = cloud.spacing or element_size
     if tumour is None:
         return np.empty((0, 3)), Spacing(largest)
@@ -149,10 +149,8 @@ def _seed(cloud: deck.Cloud, tumour: deck.Tumour | None, element_size: float) ->
 
 
 def _check_memory(cells: Floats, volume: float, spacing: Spacing, per_spacing: float) -> None:
-    """InputError if the nodes and integration points of cells (n, 8, 3) of that volume, m^3, exceed the memory.
-
-    Flat cells are cut along their edges only, into more parts than their volume asks for.
-    """
+    """InputError if the nodes and integration points of cells (n, 8, 3) with that volume, m^3, exceed the memory."""
+    # A flat cell is cut at least once along each edge, so it has more parts than its volume requires.
     cuts = edge_lengths(cells) * max(per_spacing, 1.0) / spacing(cells.mean(axis=1))[:, None]
     by_volume = spacing.n_nodes(volume) * (1 + per_spacing**3)
     n = max(by_volume, float(np.maximum(cuts, 1).prod(axis=1).sum()))
@@ -185,14 +183,14 @@ def _integrate(
 
 
 def _part(spheres: tuple[str, ...], integration_points: Ints, nodes: Ints, areas: Floats) -> Part:
-    """A part of the cloud with its nodes in ascending order; `areas` are those of the first nodes."""
+    """A part of the cloud with its nodes in ascending order; `areas` belong to the first nodes, others have none."""
     areas = np.concatenate([areas, np.zeros((len(nodes) - len(areas), 3))])
     order = np.argsort(nodes)
     return Part(spheres, integration_points, nodes[order], areas[order])
 
 
 def _surface_areas(points: Floats, hexahedra: Ints, at: Bools) -> Floats:
-    """Integral of N_a n over the surface of hexahedra, (n_points, 3), m^2, at the chosen nodes; 0 at all others."""
+    """Integral of N_a n over the surface of hexahedra, (n_points, 3), m^2, at nodes of the mask `at`; 0 elsewhere."""
     around = hexahedra[at[hexahedra].any(axis=1)]
     gradients, weights = geometry(points, around)
     areas = nodal_sum(around, weights[:, None, None] * gradients, len(points))

@@ -12,7 +12,7 @@ FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3,
 
 
 def unshared(faces: Ints) -> Ints:
-    """Rows, ascending, of the faces or edges (n, k) with a set of nodes that no other row has."""
+    """Rows, ascending, of faces or edges (n, k) that occur once, in any order of their nodes."""
     key = np.sort(faces, axis=1)
     order = np.lexsort(key.T)
     same = (np.diff(key[order], axis=0) == 0).all(axis=1)
@@ -34,12 +34,11 @@ def area_vectors(corners: Floats) -> Floats:
 def interface_faces(points: Floats, hexahedra: Ints, interface: Ints, integration_points: Floats) -> Ints:
     """Faces (n, 4) between hexahedra and cloud, anticlockwise seen from the cloud.
 
-    They belong to one hexahedron only, and all four nodes are interface nodes. A face on the outer surface may fulfil
-    both where the cloud surrounds its hexahedron; it is left out because no cloud lies beyond it.
+    They belong to one hexahedron only, and all four nodes are interface nodes. A face on the outer surface of a
+    hexahedron within the cloud has both properties too. It is left out because no cloud lies beyond it.
     """
     on_interface = np.zeros(len(points), bool)
     on_interface[interface] = True
-    # Both hexahedra of a face with interface nodes are among these.
     faces = boundary_faces(hexahedra[on_interface[hexahedra].any(axis=1)])
     faces = faces[on_interface[faces].all(axis=1)]
     if len(faces) == 0 or len(integration_points) == 0:

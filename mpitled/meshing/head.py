@@ -1,4 +1,4 @@
-"""From the voxels of a label image to the cubes of a head: one manifold solid of true volume, with its ventricles."""
+"""Convert the voxels of a label image to cubes: one manifold solid of the same volume, with its ventricles."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _CUBE_BYTES = 60  # upper bound of the memory per cube of the grid while the hea
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """The cubes from which the solid's hexahedra are chosen; at least one layer around the solid stays empty."""
+    """A regular grid of cubes around the solid, with at least one layer of empty cubes."""
 
     origin: Floats  # (3,), m
     size: float  # m
     shape: tuple[int, int, int]  # (nx, ny, nz)
 
     def index(self, point: Floats) -> tuple[int, int, int] | None:
-        """Index (z, y, x) of the cube that holds a point (3,), m; None outside the grid."""
+        """Index (z, y, x) of the cube around a point (3,), m; None outside the grid."""
         i = np.floor((point - self.origin) / self.size).astype(int)
         if (i < 0).any() or (i >= self.shape).any():
             return None
@@ -41,7 +41,7 @@ class Grid:
         return np.asarray(self.origin + self.size * np.argwhere(mask)[:, ::-1])
 
     def distance(self, mask: Mask, point: Floats) -> float:
-        """Distance, m, of a point (3,) from the nearest of the chosen cubes; infinite without any."""
+        """Distance, m, of a point (3,) from the nearest chosen cube; infinite without chosen cubes."""
         low = self.corners(mask)
         gap = np.maximum(np.maximum(low - point, point - low - self.size), 0.0)
         return float(np.linalg.norm(gap, axis=1).min(initial=np.inf))
@@ -70,7 +70,7 @@ class Head:
 
 
 def voxelise(labels: deck.Labels) -> Head:
-    """The cubes of tissue and ventricles of a label image; raises InputError as `labels.mesh_labels` does."""
+    """The cubes of tissue and ventricles of a label image; InputError as in `labels.mesh_labels`."""
     image = read_image(Path(labels.image))
     body, voxels, remarks = segment(image, labels)
     size = labels.element_size
@@ -117,14 +117,14 @@ def _grid(image: Image, body: Mask, size: float) -> Grid:
     # Two layers more than the body needs: repairs may add to it, and the outside must stay in one piece.
     wanted = np.ceil((high - low) / size - 1e-9) + 4
     overlaps = (wanted * image.labels.shape[::-1]).sum()  # see _filled_shares
-    what = f"labels.element_size = {1e3 * size:g} mm: a grid of {wanted.prod():.3g} cubes"
-    resources.check_memory(_CUBE_BYTES * (wanted.prod() + overlaps), what, "enlarge it")
+    request = f"labels.element_size = {1e3 * size:g} mm: a grid of {wanted.prod():.3g} cubes"
+    resources.check_memory(_CUBE_BYTES * (wanted.prod() + overlaps), request, "enlarge it")
     n = wanted.astype(int)
     return Grid((low + high) / 2 - size * n / 2, size, (int(n[0]), int(n[1]), int(n[2])))
 
 
 def _filled_shares(image: Image, mask: Mask, grid: Grid) -> Floats:
-    """Share (nz, ny, nx) of each of the grid's cubes that the masked voxels fill: an exact box integral."""
+    """Volume fraction (nz, ny, nx) of masked voxels in each cube of the grid: an exact box integral."""
     share = mask.astype(float)
     for axis, i in ((0, 2), (1, 1), (2, 0)):
         cubes = grid.origin[i] + grid.size * np.arange(grid.shape[i] + 1)
@@ -135,10 +135,10 @@ def _filled_shares(image: Image, mask: Mask, grid: Grid) -> Floats:
 
 
 def solid_cells(share: Floats) -> tuple[Mask, int]:
-    """One face-connected manifold solid with the shares' total volume, and the number of cubes that repairs added."""
+    """A face-connected manifold solid with the total volume of the shares, and the number of cubes added by repairs."""
     target = round(float(share.sum()))
     n, best, error, repaired = target, np.zeros(share.shape, bool), np.inf, 0
-    # Repairs only add cubes, so the next trial starts with that many fewer.
+    # Repairs only add cubes, so the next trial starts with fewer cubes.
     for _ in range(4):
         chosen = largest_piece(_fullest(share, n))
         trial = _manifold(chosen, share)
@@ -162,9 +162,9 @@ def _fullest(share: Floats, n: int) -> Mask:
 
 
 def _manifold_patterns() -> Bools:
-    """For each of 256 patterns of the 8 cubes at a node: are the full and the empty cubes each face-connected?
+    """Valid patterns (256,) of the 8 cubes at a node: the full and the empty cubes are each face-connected.
 
-    Exactly then the surface at the node is a disc (or there is none). The test covers edges too.
+    In a valid pattern the surface at the node is a disc or absent. The test includes edges.
     """
     valid = np.zeros(256, bool)
     for code in range(256):
@@ -174,7 +174,7 @@ def _manifold_patterns() -> Bools:
 
 
 def _manifold(mask: Mask, share: Floats) -> Mask:
-    """The mask with cubes added, largest share first, until its surface has no non-manifold edge or vertex."""
+    """The mask with added cubes, those of largest share first, without non-manifold edges or vertices."""
     valid = _manifold_patterns()
     mask = without_cavities(mask)
     around = list(product((0, 1), repeat=3))
@@ -193,22 +193,22 @@ def _manifold(mask: Mask, share: Floats) -> Mask:
 
 
 def _ventricles(shares: dict[str, Floats], interior: Mask) -> dict[str, Mask]:
-    """Cubes of each ventricle: one face-connected piece of the label's volume inside the interior."""
+    """Cubes of each ventricle: a face-connected piece inside the interior, with the volume of the label."""
     names = [name for name in VENTRICLES if name in shares]
     parts = {}
     for name in names:
-        own = np.where(interior, shares[name], 0.0)
+        share = np.where(interior, shares[name], 0.0)
         for other in names:
-            # A cube in both ventricles belongs to the one that fills it more, in a tie to the first.
+            # A cube in both ventricles belongs to the ventricle with the larger share, in a tie to the first ventricle.
             if other != name:
-                larger = own >= shares[other] if names.index(name) < names.index(other) else own > shares[other]
-                own = np.where(larger, own, 0.0)
-        parts[name] = _connected_part(own, round(float(shares[name].sum())))
+                larger = share >= shares[other] if names.index(name) < names.index(other) else share > shares[other]
+                share = np.where(larger, share, 0.0)
+        parts[name] = _connected_part(share, round(float(shares[name].sum())))
     return parts
 
 
 def _connected_part(share: Floats, target: int) -> Mask:
-    """The largest piece of the fullest cubes, with a number of cubes as near to `target` as possible."""
+    """The largest piece of the fullest cubes; its number of cubes is as near to `target` as possible."""
     part = np.zeros(share.shape, bool)
     if target == 0 or not share.any():
         return part

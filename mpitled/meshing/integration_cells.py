@@ -9,14 +9,14 @@ from mpitled.mesh import CORNERS, Floats, Ints
 from mpitled.meshing.spacing import Spacing
 
 _SAMPLES = 8  # points per direction in a cell that the seed's surface cuts
-_SLIVER = 0.5  # a cut cell with a smaller share outside the seed is merged into its neighbour
+_SLIVER = 0.5  # a cut cell is merged into its neighbour if a smaller share of it lies outside the seed
 _GAUSS = CORNERS / np.sqrt(3.0)  # exact to degree 3 in each coordinate: volume and first moments of trilinear cells
 
 
 def subdivide(cells: Floats, cuts: Ints) -> Floats:
-    """Corners (sum of products of cuts, 8, 3) of hexahedra (n, 8, 3) cut in `cuts` (n, 3) parts along their axes.
+    """Corners (n_parts, 8, 3) of hexahedra (n, 8, 3) that are cut into `cuts` (n, 3) parts along their axes.
 
-    A part of a trilinear cell is the trilinear cell of its own corners, so the parts fill the cell exactly.
+    A part of a trilinear cell is the trilinear cell of the part's corners, so the parts fill the cell exactly.
     """
     n_parts = cuts.prod(axis=1)
     parent = np.repeat(np.arange(len(cells)), n_parts)
@@ -48,8 +48,7 @@ def trilinear(cells: Floats, local: Floats) -> Floats:
 def _weighted(weights: Floats, cells: Floats) -> Floats:
     """Sums (n, 3) over the corners of hexahedra (n, 8, 3) with weights (n, 8), or with weights (8,) for all cells.
 
-    The sum runs corner by corner. The last bit of a BLAS product may differ between machines and would decide where
-    nodes lie.
+    The sum runs corner by corner. A BLAS product may differ between machines in the last bit and so move nodes.
     """
     total = weights[..., 0, None] * cells[:, 0]
     for corner in range(1, 8):
@@ -65,10 +64,10 @@ def edge_lengths(cells: Floats) -> Floats:
 def cut(cells: Floats, spacing: Spacing, per_spacing: float, rng: np.random.Generator) -> Floats:
     """Parts (m, 8, 3) of hexahedra (n, 8, 3), about `per_spacing` times smaller than the local node spacing.
 
-    Hexahedra over which the spacing changes much are halved first. A hexahedron is then cut in k or k + 1 parts along
-    each axis. The axes with k + 1 parts are chosen at random so that the mean number of parts is the wanted one.
+    If the spacing changes much over a hexahedron, it is first halved. Each hexahedron is then cut into k or k + 1 parts
+    along each axis. The axes with k + 1 parts are chosen at random so that the mean number of parts is as requested.
     """
-    done = []
+    parts = []
     while len(cells):
         centres = cells.mean(axis=1)
         reach = np.linalg.norm(cells - centres[:, None], axis=2).max(axis=1)
@@ -76,15 +75,15 @@ def cut(cells: Floats, spacing: Spacing, per_spacing: float, rng: np.random.Gene
         ratio = edge_lengths(cells) * per_spacing / spacing(centres)[:, None]
         uneven = spacing.at_distance(distance + reach) > 1.6 * spacing.at_distance(distance - reach)
         halve = uneven & (ratio.max(axis=1) > 1.5)
-        done.append(subdivide(cells[~halve], _random_cuts(ratio[~halve], rng)))
+        parts.append(subdivide(cells[~halve], _random_cuts(ratio[~halve], rng)))
         cells = subdivide(cells[halve], np.where(ratio[halve] > 1.5, 2, 1))
-    return np.concatenate(done)
+    return np.concatenate(parts)
 
 
 def _random_cuts(ratio: Floats, rng: np.random.Generator) -> Ints:
     """Numbers of parts (n, 3) along the axes; the mean of their product is the product of the ratios (n, 3)."""
     low = np.maximum(np.floor(ratio), 1).astype(np.int64)
-    # The axis that is furthest below its ratio comes first; noise breaks ties at random.
+    # The axis with the largest ratio to its number of parts comes first; noise breaks ties at random.
     lack = (ratio / low) * rng.uniform(1, 1.001, ratio.shape)
     rank = np.argsort(np.argsort(-lack, axis=1), axis=1)
     steps = np.stack([(low + (rank < m)).prod(axis=1) for m in range(4)], axis=1)
@@ -100,8 +99,8 @@ def outside_seed(
 ) -> tuple[Floats, Floats, Ints, float]:
     """Volumes, centroids and rows of the cells (n, 8, 3) outside the seed, and the sampled volume, m^3.
 
-    Cells that the sphere cuts are sampled. Slivers are merged into the nearest point. The sampling error of the total
-    volume is spread over the cut cells, so that the volumes sum to the exact total.
+    Cells that the sphere cuts are sampled. Slivers are merged into the nearest point. The volumes of cut cells are
+    rescaled so that the sum is exact.
     """
     assert spacing.centre is not None
     middle = cells.mean(axis=1)
@@ -113,7 +112,7 @@ def outside_seed(
     outside = spacing.distance(samples.reshape(-1, 3)).reshape(len(near), -1) >= spacing.radius
     share = outside.mean(axis=1)
     is_cut = (share > 0) & (share < 1)
-    whole = volumes
+    uncut = volumes
     volumes, centroids = volumes.copy(), centroids.copy()
     volumes[near] *= share
     cut_cells = near[is_cut]
@@ -121,9 +120,9 @@ def outside_seed(
     centroids[cut_cells] = sums / outside[is_cut].sum(axis=1)[:, None]
 
     sampled = volumes.sum()
-    volumes[cut_cells] *= 1 + (whole.sum() - spacing.seed_volume - sampled) / volumes[cut_cells].sum()
+    volumes[cut_cells] *= 1 + (uncut.sum() - spacing.seed_volume - sampled) / volumes[cut_cells].sum()
 
-    sliver = (volumes > 0) & (volumes < _SLIVER * whole)
+    sliver = (volumes > 0) & (volumes < _SLIVER * uncut)
     kept = np.flatnonzero((volumes > 0) & ~sliver)
     into = kept[cKDTree(centroids[kept]).query(centroids[sliver])[1]]
     moments = centroids * volumes[:, None]

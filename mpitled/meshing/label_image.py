@@ -1,4 +1,4 @@
-"""Read a label image of a head: voxels and their labels, and the voxels of each part. One of two users of nibabel."""
+"""Read a label image of a head with nibabel, and find the voxels of each part."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from mpitled.mesh import Bools, Floats
 if TYPE_CHECKING:
     from mpitled import deck
 
-Mask = Bools  # (nz, ny, nx), so that x runs fastest in memory and in all numbers
+Mask = Bools  # (nz, ny, nx): x runs fastest in memory and in the numbering
 
 _METRES = {"mm": 1e-3, "unknown": 1e-3, "meter": 1.0, "micron": 1e-6}
 #: Image formats that are read; other formats of nibabel may refer to further files.
 _SUFFIXES = (".nii", ".nii.gz", ".mgh", ".mgz")
-_VOXEL_BYTES = 40  # upper bound of the memory per voxel, beside its label, while the head is meshed
+_VOXEL_BYTES = 40  # upper bound of the memory per voxel, without its label, while the head is meshed
 _MAX_INFLATION = 1032  # gzip expands a byte to at most this many
 _MAX_HEADER = 1 << 24  # bytes of a NIfTI file before its voxels
-#: Parts of a head beside its tissue, left and right: keys of the deck, and cell and node sets.
+#: Parts of a head beside its tissue: keys of the deck, and names of cell and node sets.
 VENTRICLES = ("left_ventricle", "right_ventricle")
 
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """A label image on an axis-parallel grid of voxels, in metres of the image's world (x to the right, z up)."""
+    """A label image on an axis-parallel grid of voxels, in world coordinates in metres (x to the right, z up)."""
 
     path: Path
     labels: NDArray[np.int32]  # (nz, ny, nx)
@@ -47,7 +47,7 @@ class Image:
 def read_image(path: Path) -> Image:
     """The label image of a NIfTI or MGH file, reoriented to x right, y front, z up.
 
-    Raises InputError if the file is missing, no image, not three-dimensional, oblique, or holds other than integers.
+    InputError if the file is missing, no image, not three-dimensional, oblique, or has values that are no integers.
     """
     try:
         import nibabel
@@ -103,12 +103,12 @@ def read_image(path: Path) -> Image:
 
 
 def is_image(path: Path) -> bool:
-    """Whether the file's name ends as that of an image in a known format."""
+    """Whether the file's name has the suffix of a known image format."""
     return path.name.lower().endswith(_SUFFIXES)
 
 
 def contents(path: Path) -> dict[str, Any]:
-    """Voxels of a label image along x, y, z, their edges (mm), its extent (mm), and the volume of each label (ml)."""
+    """Numbers of voxels of a label image along x, y, z, voxel edges and extent in mm, and volumes of labels in ml."""
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; give an image of labels")
     image = read_image(path)
@@ -125,9 +125,9 @@ def contents(path: Path) -> dict[str, Any]:
 
 
 def segment(image: Image, labels: deck.Labels) -> tuple[Mask, dict[str, Mask], list[str]]:
-    """Masks of the body (one piece without cavities) and of each ventricle within it, and remarks.
+    """Masks of the body (one piece without cavities) and of each ventricle in it, and remarks.
 
-    Raises InputError for labels that are missing or given twice.
+    InputError if a label is missing or given twice.
     """
     wanted = {name: getattr(labels, name) for name in ("tissue", *VENTRICLES) if len(getattr(labels, name))}
     numbers = [number for several in wanted.values() for number in several]
@@ -161,13 +161,13 @@ def largest_piece(mask: Mask) -> Mask:
 
 
 def piece_at(mask: Mask, index: tuple[int, int, int]) -> Mask:
-    """The face-connected piece of the mask that holds the element `index`."""
+    """The face-connected piece of the mask with the element `index`."""
     pieces, _ = ndimage.label(mask)
     return (pieces == pieces[index]) & mask
 
 
 def without_cavities(mask: Mask) -> Mask:
-    """The mask with all elements filled that are not face-connected to the outside."""
+    """The mask with filled cavities: elements that are not face-connected to the outside."""
     outside = piece_at(np.pad(~mask, 1, constant_values=True), (0, 0, 0))
     return ~outside[1:-1, 1:-1, 1:-1]
 

@@ -26,8 +26,8 @@ def mesh_labels(
     """The mesh of a label image: one face-connected solid of cubes without non-manifold edges or vertices.
 
     Each label keeps its volume. Each ventricle is one face-connected piece that does not touch the outer surface. With
-    a tumour the tissue within `cloud.radius` of its centre becomes a cloud. Raises InputError for a file that is no
-    label image, for labels that are missing, and for a tumour outside the tissue.
+    a tumour the tissue within `cloud.radius` of its centre becomes a cloud. InputError if the file is no label image,
+    if labels are missing, or if the tumour lies outside the tissue.
     """
     head = voxelise(labels)
     points, hexahedra = head.grid.hexahedra(head.solid)
@@ -49,10 +49,10 @@ def mesh_labels(
 
 
 def _void(head: Head, radius: float, centre: Floats, needed: float) -> Mask:
-    """Cubes of tissue within the radius of the tumour's centre that the cloud replaces: one piece around the centre.
+    """Cubes of tissue within the radius, m, of the tumour's centre, to be replaced by the cloud: one piece.
 
-    No cube with a node on the skull is among them, and the rest of the solid is one piece. InputError if the centre is
-    not in tissue, or if a cube that must stay is nearer than `needed`, m.
+    Cubes with a node on the skull stay, and the rest of the solid is one piece. InputError if the centre is not in
+    tissue, or if a cube that must stay is nearer than `needed`, m.
     """
     key = f"tumour.centre = {format_position(centre)}"
     grid, parts = head.grid, head.parts
@@ -114,8 +114,8 @@ def _voxel_hint(head: Head, centre: Floats) -> str:
 
 
 def _alternative(grid: Grid, replaceable: Mask, centre: Floats, needed: float) -> str:
-    """In words, the position nearest to the centre with only replaceable cubes within `needed`, m."""
-    # The transform gives distances between centres of cubes; a point may be half a diagonal nearer to a corner.
+    """Text with the position nearest to the centre (3,), m, that has only replaceable cubes within `needed`, m."""
+    # The transform gives distances between centres of cubes. A corner may be half a diagonal nearer.
     far = grid.size * (ndimage.distance_transform_edt(replaceable) - 3**0.5 / 2)
     centres = grid.origin + grid.size * (np.argwhere(far >= needed)[:, ::-1] + 0.5)
     if not len(centres):

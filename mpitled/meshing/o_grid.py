@@ -7,17 +7,16 @@ import numpy as np
 from mpitled.mesh import Bools, Floats, Ints, grid_points, structured_hexahedra
 from mpitled.meshing.faces import boundary_faces, unshared
 
-# Half the core's width over the radius, and the bulge of the core's sides towards the circle or sphere. Both come from
-# a search for even cells with a good worst corner (scaled Jacobian 0.85 in a cylinder, 0.71 in a ball with volumes 1 to
-# 6).
+# Half the core's width over the radius, and the bulge of the core's sides towards the circle or sphere. Found by a
+# search for even cells with good corners (minimum scaled Jacobian 0.85 in a cylinder, 0.71 in a ball).
 _CORE, _BULGE = 0.5, 0.4
 
 
 class OGrid:
     """The mesh of a disc or ball of radius 1: a square or cube-like core and shells around it.
 
-    Lines of the core are straight near the middle and bend towards the sphere further out. Between core and sphere they
-    are straight. Nodes are the core's grid, x fastest, then one shell after the other.
+    Lines of the core are straight near the middle and bend towards the sphere. Between core and sphere the lines are
+    straight. Nodes of the core come first, x fastest, then one shell after the other.
     """
 
     points: Floats  # (n_nodes, d)
@@ -31,8 +30,8 @@ class OGrid:
     ) -> None:
         """`shape`: cells along each axis of the core. `radius` and `element_size` (m) give the number of shells.
 
-        The outermost shell has the share `outermost` of the shells' mean thickness. Across a ball's core, cells beside
-        the coordinates 1/2 and 1 of the cube have the share `lines` of the mean width.
+        `outermost` is the thickness of the outermost shell over the mean thickness. `lines` is, in the core of a ball,
+        the width of cells beside the coordinates 1/2 and 1 of the cube over the mean width.
         """
         d = len(shape)
         nx, ny, nz = (*shape, 1)[:3]
@@ -40,7 +39,7 @@ class OGrid:
         core_cells = structured_hexahedra((nx, ny, nz))
         if d == 2:
             grid, core_cells = grid[: len(grid) // 2], core_cells[:, :4]
-        # Whole numbers of cells give the faces' coordinate 1 and the patch's edge 1/2 without round-off.
+        # Integers remove the round-off of the coordinates 1 (faces) and 1/2 (edge of the patch).
         grid = np.rint((grid + 1) / 2 * shape) * 2 / shape - 1
         grid = _crowded(grid, lines)
         level = np.abs(grid).max(axis=1)
@@ -71,14 +70,14 @@ class OGrid:
         self._outermost = np.arange(len(self.cells)) >= len(self.cells) - len(self.faces)
 
     def core(self, share: float) -> Bools:
-        """Cells (n_cells,) whose middle lies within that share of the radius, never those of the outermost shell."""
+        """Mask (n_cells,) of cells with their middle within that share of the radius, without the outermost shell."""
         return (self._radius <= share) & ~self._outermost
 
 
 def graded(n: int, smallest: float, both_ends: bool = False) -> Floats:
-    """Ends (n + 1,) of n parts of [0, 1]; their lengths fall to `smallest` times the mean at 1, or at both ends.
+    """Ends (n + 1,) of n parts of [0, 1]; lengths decrease to `smallest` times the mean at 1, or at both ends.
 
-    The ends come from a smooth map, so errors fall with n as with equal parts.
+    The map is smooth, so the order of convergence is that of equal parts.
     """
     s, cycles = np.arange(n + 1) / n, 2 if both_ends else 1
     shift = (1 - smallest) * np.sin(cycles * np.pi * s) / (cycles * np.pi)
@@ -108,7 +107,7 @@ def on_sphere(cube: Floats) -> Floats:
 
 
 def _boundary_edges(quads: Ints) -> Ints:
-    """Edges (n, 2) that belong to one of the quadrilaterals (n, 4) only, in their sense of rotation."""
+    """Edges (n, 2) that belong to one quadrilateral (n, 4) only, in the direction of its nodes."""
     edges = np.stack([quads, np.roll(quads, -1, axis=1)], axis=2).reshape(-1, 2)
     return edges[unshared(edges)]
 

@@ -16,9 +16,9 @@ from mpitled.meshing.placement import format_position
 if TYPE_CHECKING:
     from mpitled import deck
 
-# Elements across the core per element size in the radius; makes the mean edge the element size asked for.
+# Elements across the core over the ratio of radius to element size: the mean edge is then the element size.
 _ACROSS = 1.1
-# Layers with their centre within this share of the core's end do not belong to it: round-off must not decide.
+# A layer at the end of the core does not belong to the core, independent of round-off.
 _TIE = 1e-9
 # Thickness over width of the cells in the shells around a seed.
 _THICK = 1.5
@@ -27,17 +27,18 @@ _THICK = 1.5
 def cylinder_mesh(
     cylinder: deck.Cylinder, cloud: deck.Cloud, tumour: deck.Tumour | None, spheres: Sequence[deck.Sphere] = ()
 ) -> Mesh:
-    """The mesh of a cylinder along z from z = 0, a square core in rings: sets bottom, top, side and, together, surface.
+    """The mesh of a cylinder along z from z = 0, an O-grid; its node sets are bottom, top, side and surface (all).
 
-    A core cloud ends at the ring or layer nearest to `core_share` of radius and height. With a tumour it replaces the
-    hexahedra within `cloud.radius` of the tumour's centre. InputError for a tumour without a cloud or without room.
+    A core cloud ends at the ring or layer nearest to `core_share` of radius and height. With a tumour, the core cloud
+    replaces the hexahedra within `cloud.radius` of the tumour's centre. InputError if a tumour has no cloud or does not
+    fit.
     """
     if tumour is not None and cylinder.cloud == "none":
         raise InputError('cylinder.cloud = "none": a tumour grows in a cloud; set it to "core" or "all"')
     size = _element_size(cylinder, cloud)
     check_size((np.pi * (cylinder.radius / size) ** 2 + 1) * (cylinder.height / size + 1), "cylinder.element_size")
     n = 2 * whole_number(_ACROSS * cylinder.radius / (2 * size))
-    # A cloud has no layers, and the nodes on its surface should be as even as those inside.
+    # In a cloud, surface nodes should be as evenly spaced as inner nodes.
     grading = 1.0 if cylinder.cloud == "all" else cylinder.grading
     o_grid = OGrid((n, n), cylinder.radius, size, grading)
     layers = whole_number(cylinder.height / size)
@@ -65,8 +66,8 @@ def ellipsoid_mesh(
     Let (p, q, r) = (x/a, y/b, z/c) and t = tan(pi/8). The node sets are surface, patch (r > 0, |p| <= t r, |q| <= t r
     on the surface) and fixed (r < 0, |p| <= -r, |q| <= -r on the surface). The numbers of elements are divisible by 4,
     so that patch and fixed end at element edges. A core cloud ends at the shell nearest to `core_share` of the
-    semi-axes. With a tumour it replaces the hexahedra within `cloud.radius` of the tumour's centre. Without a cloud,
-    `cavity` chooses the mesh of the seed. InputError for a tumour without room.
+    semi-axes. With a tumour, the core cloud replaces the hexahedra within `cloud.radius` of the tumour's centre.
+    Without a cloud, `cavity` chooses the mesh of the seed. InputError if a tumour does not fit.
     """
     axes, size = np.asarray(ellipsoid.semi_axes), _element_size(ellipsoid, cloud)
     # Estimates of the cells in the core and in the shells around it.
@@ -88,19 +89,19 @@ def ellipsoid_mesh(
     if tumour is None or ellipsoid.cloud != "none":
         core = o_grid.core(ellipsoid.core_share)
         return _filled(ellipsoid.cloud, core, points, o_grid.cells, node_sets, cloud, tumour, size, spheres)
-    _check_room(tumour, axes, size)
+    _check_seed_fits(tumour, axes, size)
     if ellipsoid.cavity == "moved":
         return _moved(points, o_grid.cells, node_sets, axes, np.asarray(tumour.centre))
     return _fitted(points[o_grid.surface], o_grid, node_sets, tumour, size)
 
 
 def _element_size(phantom: deck.Cylinder | deck.Ellipsoid, cloud: deck.Cloud) -> float:
-    """The element size, m. A cloud for all hexahedra has their boundary nodes, so the elements follow its spacing."""
+    """The element size, m: the spacing of a cloud that replaces all elements, because their boundary nodes remain."""
     return cloud.spacing if phantom.cloud == "all" and cloud.spacing else phantom.element_size
 
 
 def _filled(
-    which: str,
+    cloud_option: str,
     core: Bools,
     points: Floats,
     hexahedra: Ints,
@@ -110,20 +111,20 @@ def _filled(
     element_size: float,
     spheres: Sequence[deck.Sphere],
 ) -> Mesh:
-    """The mesh with the cloud that the deck asks for: "none", "core" or "all"."""
-    if which == "none":
+    """The mesh with the cloud of the deck's option: "none", "core" or "all"."""
+    if cloud_option == "none":
         return hexahedral_mesh(points, hexahedra, node_sets)
-    if which == "all":
+    if cloud_option == "all":
         core = np.ones(len(hexahedra), bool)
     elif tumour is not None:
         core = near_centre(points, hexahedra, tumour, cloud.radius)
     return build_cloud(points, hexahedra, core, node_sets, cloud, tumour, element_size, spheres).mesh
 
 
-def _check_room(tumour: deck.Tumour, axes: Floats, element_size: float) -> None:
+def _check_seed_fits(tumour: deck.Tumour, axes: Floats, element_size: float) -> None:
     """InputError unless the seed, with an element's size around it, lies inside the ellipsoid."""
-    centre, room = np.asarray(tumour.centre), tumour.seed_radius + element_size
-    if room >= axes.min() or np.linalg.norm(centre / (axes - room)) > 1:
+    centre, needed = np.asarray(tumour.centre), tumour.seed_radius + element_size
+    if needed >= axes.min() or np.linalg.norm(centre / (axes - needed)) > 1:
         raise InputError(
             f"tumour.centre = {format_position(centre)}: the seed and an element's size around it do not fit into the "
             "ellipsoid; move it, or make tumour.seed_radius or ellipsoid.element_size smaller"
@@ -133,8 +134,8 @@ def _check_room(tumour: deck.Tumour, axes: Floats, element_size: float) -> None:
 def _fitted(outer: Floats, o_grid: OGrid, node_sets: dict[str, Ints], tumour: deck.Tumour, element_size: float) -> Mesh:
     """Shells from the seed's surface (node set tumour) to the ellipsoid's surface nodes `outer` (n, 3).
 
-    The width of cells grows with the distance to the centre. Shells are _THICK times as thick as their cells are wide,
-    because growth makes them thin and wide, but at most an element's size. Lines leave the seed at right angles and
+    The width of cells grows with the distance to the centre. The thickness of a shell is _THICK times the width of its
+    cells, because growth makes cells thin and wide, but at most an element's size. Lines are normal to the seed and
     turn evenly towards their nodes on the surface.
     """
     centre, seed = np.asarray(tumour.centre), tumour.seed_radius
@@ -144,10 +145,12 @@ def _fitted(outer: Floats, o_grid: OGrid, node_sets: dict[str, Ints], tumour: de
     ends = np.log(np.minimum(reach, even) / seed) / growth + np.maximum(reach - even, 0) / (growth * even)
     n = whole_number(np.ceil(ends.mean()))
     check_size(float(n) * len(o_grid.faces), "ellipsoid.element_size")
-    place = ends * np.arange(n + 1)[:, None] / n  # (shells, lines), in thicknesses
+    thicknesses = ends * np.arange(n + 1)[:, None] / n  # (shells, lines), distance in multiples of the thickness
     turn = np.log(even / seed) / growth
     radius = np.where(
-        place < turn, seed * np.exp(growth * np.minimum(place, turn)), even * (1 + growth * (place - turn))
+        thicknesses < turn,
+        seed * np.exp(growth * np.minimum(thicknesses, turn)),
+        even * (1 + growth * (thicknesses - turn)),
     )
     share = ((radius - seed) / (reach - seed))[..., None]
     direction = (1 - share) * on_sphere(o_grid.cube) + share * ((outer - centre) / reach[:, None])
@@ -161,13 +164,13 @@ def _fitted(outer: Floats, o_grid: OGrid, node_sets: dict[str, Ints], tumour: de
 
 
 def _moved(points: Floats, hexahedra: Ints, node_sets: dict[str, Ints], axes: Floats, centre: Floats) -> Mesh:
-    """A mesh that does not follow the seed's surface: one hexahedron is the cavity, its nodes are the set tumour.
+    """A mesh that does not follow the seed's surface: one hexahedron is the cavity, and its nodes are the set tumour.
 
-    A shift that fades towards the surface moves the centre of this hexahedron to the tumour's centre.
+    A shift that is zero on the surface moves the centre of this hexahedron to the tumour's centre.
     """
     middle = points[hexahedra].mean(axis=1)
     hole = int(np.linalg.norm(middle - centre, axis=1).argmin())
-    for _ in range(30):  # to round-off: the error is squared by the elements' size over the ellipsoid's, about a tenth
+    for _ in range(30):  # to round-off: each iteration reduces the error to about a tenth
         fade = 1 - ((points / axes) ** 2).sum(axis=1)
         shift = centre - points[hexahedra[hole]].mean(axis=0)
         points = points + (fade / fade[hexahedra[hole]].mean())[:, None] * shift

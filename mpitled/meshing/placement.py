@@ -1,4 +1,4 @@
-"""Where the tumour's seed lies in the body, and how messages show positions and lengths."""
+"""Checks of the position of the tumour's seed, and positions and lengths in messages."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ if TYPE_CHECKING:
 
 
 def format_position(position: Floats) -> str:
-    """A position (3,), m, in millimetres, as the user wrote it in the deck."""
+    """A position (3,), m, as text in millimetres."""
     return "(" + ", ".join(f"{1e3 * x:g}" for x in position) + ") mm"
 
 
 def format_length(metres: float) -> str:
-    """A length in millimetres, rounded to 0.01 mm and three digits."""
+    """A length, m, as text in millimetres, rounded to 0.01 mm and three digits."""
     return f"{round(1e3 * metres, 2):.3g} mm"
 
 
 def unit_hint(position: Floats, low: Floats, high: Floats) -> str:
-    """A hint if the deck's numbers for a position (3,), m, taken as metres, lie in the box low to high, m; else ""."""
-    meant = 1e3 * position
-    if not 0 < np.abs(position).max() < 1e-3 or not ((low <= meant) & (meant <= high)).all():
+    """A hint or "": 1000 times the position (3,), m, lies in the box low to high, m, as if written in metres."""
+    in_metres = 1e3 * position
+    if not 0 < np.abs(position).max() < 1e-3 or not ((low <= in_metres) & (in_metres <= high)).all():
         return ""
-    return f"it looks like metres: in mm it is {format_position(meant).removesuffix(' mm')}"
+    return f"it looks like metres: in mm it is {format_position(in_metres).removesuffix(' mm')}"
 
 
 def in_sphere(points: Floats, sphere: deck.Sphere) -> Bools:
-    """Which of the points (n, 3), m, lie in the sphere."""
+    """Mask (n,) of points (n, 3), m, in the sphere."""
     return np.asarray(np.linalg.norm(points - np.asarray(sphere.centre), axis=1) <= sphere.radius)
 
 
@@ -51,9 +51,9 @@ def check_inside(points: Floats, hexahedra: Ints, tumour: deck.Tumour) -> None:
 
 
 def check_seed_fits(points: Floats, boundary: Ints, tumour: deck.Tumour, element_size: float, radius: float) -> None:
-    """InputError unless the seed lies inside the cloud's boundary (n, 4), with cloud of an element's size around it.
+    """InputError unless the seed lies inside the cloud's boundary (n, 4), with an element's size of cloud around it.
 
-    `radius` (m) is cloud.radius. Hexahedra with their centre within it are replaced if they may be replaced.
+    `radius` (m) is cloud.radius: replaceable hexahedra with their centre within it are replaced.
     """
     centre = np.asarray(tumour.centre, float)
     inside, distance = _locate(points[boundary], centre)
@@ -77,7 +77,7 @@ def check_seed_fits(points: Floats, boundary: Ints, tumour: deck.Tumour, element
 
 
 def _locate(surface: Floats, point: Floats) -> tuple[bool, float]:
-    """Whether a point (3,) lies inside a closed surface of quadrilaterals (n, 4, 3), and its distance from it, m."""
+    """Whether a point (3,) lies inside a closed surface of quadrilaterals (n, 4, 3), and their distance, m."""
     quads = surface - point
     # Solid angles of a closed surface sum to 4 pi for a point inside, to 0 outside (van Oosterom and Strackee 1983).
     a, b, c = np.moveaxis(np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]), 1, 0)

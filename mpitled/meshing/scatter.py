@@ -9,22 +9,22 @@ from mpitled.mesh import Bools, Floats, Ints
 from mpitled.meshing.integration_cells import cut, trilinear, volumes_and_centroids
 from mpitled.meshing.spacing import Spacing
 
-#: Smallest distance of two nodes as a share of the local spacing; two interface nodes may be closer.
+#: Smallest distance of two nodes over the local spacing; two interface nodes may be nearer.
 CLOSEST = 0.6
 # Dart throwing at 0.83 of the spacing s ends with one node per s^3 (measured: 0.97 to 1.01).
 _DART = 0.83
 _CHUNK = 1 << 15  # candidates computed at once; bounds the temporary memory
 _CANDIDATES = 24  # candidates per node
-_SWEEPS = 3  # of Lloyd; more change nothing, because nodes move from candidate to candidate
-_ROUNDS = 24  # of dart throwing, approximately
+_SWEEPS = 3  # Lloyd sweeps; more sweeps change nothing, because nodes move from candidate to candidate
+_ROUNDS = 24  # approximate number of rounds of dart throwing
 
 
 def scatter(cells: Floats, spacing: Spacing, occupied: Floats, irregularity: float, rng: np.random.Generator) -> Floats:
     """Irregular nodes (n, 3), one per cubed spacing, in hexahedra (m, 8, 3) around the `occupied` points (k, 3).
 
-    Dart throwing finds points with a minimum distance and without holes, Lloyd sweeps even them out, and a random shift
-    by up to `irregularity` spacings follows. All steps choose among random candidates inside the hexahedra and outside
-    the seed. So no node can leave the void, whatever its shape.
+    Dart throwing finds points with a minimum distance and without holes. Lloyd sweeps make them even. Then each point
+    is shifted at random by up to `irregularity` spacings. All steps choose from random candidates inside the hexahedra
+    and outside the seed, so no node can leave the void.
     """
     candidates = _candidates(cells, spacing, rng)
     local = spacing(candidates)
@@ -56,9 +56,9 @@ def _candidates(cells: Floats, spacing: Spacing, rng: np.random.Generator) -> Fl
 
 
 def _throw_darts(candidates: Floats, min_distance: Floats, occupied: Floats, rng: np.random.Generator) -> Ints:
-    """A maximal set of candidates that keep their `min_distance` (n,) from each other and from the occupied points.
+    """A maximal set of candidates with distances of at least `min_distance` (n,) to each other and occupied points.
 
-    Poisson-disc sampling (Cook 1986), in rounds of many darts at once.
+    Poisson-disc sampling (Cook 1986), in rounds of many darts.
     """
     alive = rng.permutation(np.flatnonzero(_clear(candidates, min_distance, occupied)))
     chosen = []
@@ -71,13 +71,13 @@ def _throw_darts(candidates: Floats, min_distance: Floats, occupied: Floats, rng
 
 
 def _separate(candidates: Floats, min_distance: Floats, nodes: Ints, occupied: Floats) -> Ints:
-    """Nodes without those too near to an occupied point or to an earlier node."""
+    """Nodes that are not too near to an occupied point or to an earlier node."""
     nodes = nodes[_clear(candidates[nodes], min_distance[nodes], occupied)]
     while len(nodes) > 1:
         distance, neighbour = cKDTree(candidates[nodes]).query(candidates[nodes], k=2)
         late = (distance[:, 1] < min_distance[nodes]) & (neighbour[:, 1] < np.arange(len(nodes)))
         early = (distance[:, 1] < min_distance[nodes]) & ~late
-        # The later node of a pair is dropped, also where only the earlier node's minimum distance is violated.
+        # The later node of a pair is removed, also if only the earlier node's minimum distance is violated.
         late[neighbour[early, 1]] = True
         if not late.any():
             break
@@ -86,7 +86,7 @@ def _separate(candidates: Floats, min_distance: Floats, nodes: Ints, occupied: F
 
 
 def _lloyd(candidates: Floats, local: Floats, nodes: Ints, occupied: Floats) -> Ints:
-    """Move each node to the candidate of its Voronoi cell next to the cell's centroid (Lloyd 1982)."""
+    """Move each node to the candidate nearest to the centroid of the node's Voronoi cell (Lloyd 1982)."""
     owner = cKDTree(np.concatenate([candidates[nodes], occupied])).query(candidates)[1]
     owned = owner < len(nodes)
     owner, members = owner[owned], np.flatnonzero(owned)
@@ -104,7 +104,7 @@ def _lloyd(candidates: Floats, local: Floats, nodes: Ints, occupied: Floats) -> 
 def _shift(
     candidates: Floats, local: Floats, nodes: Ints, occupied: Floats, irregularity: float, rng: np.random.Generator
 ) -> Ints:
-    """Move nodes at random by up to `irregularity` spacings, unless they come too near to another node."""
+    """Move nodes at random by up to `irregularity` spacings, unless a node comes too near to another node."""
     direction = rng.normal(size=(len(nodes), 3))
     length = irregularity * local[nodes] * rng.random(len(nodes)) ** (1 / 3) / np.linalg.norm(direction, axis=1)
     wanted = candidates[nodes] + length[:, None] * direction
@@ -123,7 +123,7 @@ def _shift(
 
 
 def _clear(points: Floats, min_distance: Floats, others: Floats) -> Bools:
-    """Which of the points (n, 3) have their own `min_distance` (n,) from all others (m, 3)."""
+    """Mask (n,) of points (n, 3) at a distance of at least `min_distance` (n,) from all `others` (m, 3)."""
     if len(others) == 0 or len(points) == 0:
         return np.ones(len(points), bool)
     distance = cKDTree(others).query(points, distance_upper_bound=min_distance.max())[0]

@@ -10,17 +10,18 @@ from scipy.spatial import cKDTree
 from mpitled.mesh import Floats, Ints
 from mpitled.meshing.faces import area_vectors
 
-# Growth of the spacing with the distance from faces between parts. With 0.1 a soft sphere's error is 1.3 to 1.5 times
-# larger.
+# Growth of the spacing with the distance from faces between parts. With 0.1 the error of a soft sphere is 1.3 to 1.5
+# times larger.
 _GROWTH_FROM_FACES = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class Spacing:
-    """Distance between EFG nodes: it grows from the seed's surface outwards by `growth` per metre, up to `largest`.
+    """Distance between EFG nodes. It grows from the seed's surface outwards by `growth` per metre, up to `largest`.
 
-    With a surface spacing of `growth` times the seed's radius, the spacing is `growth` times the distance to the
-    centre. A finer surface lowers the whole line, so that the spacing has no jump. Without a seed it is `largest`.
+    If the surface spacing is `growth` times the seed's radius, the spacing is `growth` times the distance to the
+    centre. A smaller surface spacing reduces the spacing everywhere, without a jump. Without a seed the spacing is
+    `largest`.
     """
 
     largest: float  # m
@@ -28,7 +29,7 @@ class Spacing:
     centre: Floats | None = None  # of the seed, m; None without a seed
     radius: float = 0.0  # of the seed, m
     at_surface: float = 0.0  # m
-    # Centres (n, 3), m, of faces between parts, and their sizes (n,), m; the spacing near a face is at most its size.
+    # Tree of centres (n, 3), m, of faces between parts, and sizes (n,), m; a size limits the spacing near its face.
     faces: tuple[cKDTree, Floats] | None = None
 
     @property
@@ -67,7 +68,7 @@ class Spacing:
         return float(((density[1:] + density[:-1]) / 2 * np.diff(r)).sum())
 
     def refined(self, points: Floats, boundaries: list[Ints]) -> Spacing:
-        """This spacing, but at most the size of the faces (n, 4) that two of the parts' boundaries share."""
+        """This spacing, limited near faces (n, 4) of two boundaries to the size of the face."""
         faces = np.concatenate(boundaries)
         _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
         if not (count > 1).any():

@@ -16,7 +16,8 @@ from mpitled.mesh import Mesh
 from mpitled.meshing import checks
 from mpitled.model import CellBlock, Model, ModelFigures
 from mpitled.model import remarks as warnings
-from mpitled.model.cloud_fit import consistent_gradients, find_domains, without_orphans
+from mpitled.model.consistency import consistent_gradients
+from mpitled.model.domain_nodes import domains_of_mesh, without_orphans
 from mpitled.model.materials import assign_materials
 from mpitled.model.prescribed import check_growth, prescribe
 from mpitled.model.scene import OUTER, TUMOUR, read_mesh
@@ -32,7 +33,7 @@ def build(deck: Deck) -> Model:
 def discretise(deck: Deck, mesh: Mesh) -> Model:
     """The model of a deck from its mesh; see `build`."""
     material, materials = assign_materials(deck, mesh)
-    domains, found = find_domains(deck, mesh, material)
+    domains, found = domains_of_mesh(deck, mesh, material)
     mesh, domains, n_orphans = without_orphans(deck, mesh, domains)
     points, at, options = mesh.points, mesh.integration_points, deck.support
     shapes, gradients, condition = support.moving_least_squares(points[domains], at, options.basis, options.weight)
@@ -99,7 +100,7 @@ def _masses(
     """Masses (n_nodes,) of the nodes, kg (eq. 4.17 and 4.18), and their sum."""
     density = np.array([material.density for material in materials])
     of_cells = [density[block.material] * block.volumes(points) for block in blocks]
-    nodal = (nodal_mass(block.nodes, own, len(points)) for block, own in zip(blocks, of_cells, strict=True))
+    nodal = (nodal_mass(block.nodes, mass, len(points)) for block, mass in zip(blocks, of_cells, strict=True))
     return np.add.reduce([*nodal]), float(np.concatenate(of_cells).sum())
 
 
@@ -117,16 +118,16 @@ def _critical_steps(
     stiffness, volume = np.zeros(len(points)), 0.0
     for block in blocks:
         gradients, volumes = block.geometry(points, deck.hexahedra.gradient)
-        own = modulus[block.material] * (volumes * (gradients**2).sum((1, 2))) * control[block.kind.name]
-        stiffness += nodal_mass(block.nodes, block.nodes.shape[1] * own, len(points))
+        of_cells = modulus[block.material] * (volumes * (gradients**2).sum((1, 2))) * control[block.kind.name]
+        stiffness += nodal_mass(block.nodes, block.nodes.shape[1] * of_cells, len(points))
         volume += float(volumes.sum())
     return 2 * np.sqrt(mass / stiffness), volume
 
 
 def _typical(critical: NDArray[np.float64], prescribed: NDArray[np.int64], in_domains: NDArray[np.int64]) -> float:
-    """Median of the critical steps (n_nodes,) of nodes that are free and, if there are such, beyond the cloud, s.
+    """Median, s, of the critical steps (n_nodes,) of free nodes, outside the cloud if there are free nodes outside.
 
-    The cloud is fine next to a seed. A few heavier nodes there cost less than a short step everywhere.
+    The cloud is fine next to a seed: mass scaling of a few nodes costs less than a short step for the whole model.
     """
     free = np.setdiff1d(np.arange(len(critical)), prescribed)
     if not len(free):

@@ -22,10 +22,10 @@ def sphere_radius(volume: float) -> float:
 def growth(
     points: NDArray[np.float64], centre: NDArray[np.float64], seed_radius: float, volume: float
 ) -> NDArray[np.float64]:
-    """Displacement (n, 3), m at full load, of nodes on the seed's surface: radially, to the sphere of that volume.
+    """Radial displacement (n, 3), m at full load, of nodes (n, 3), m, on the seed's surface to a sphere of that volume.
 
-    Nodes that are not quite on it, as in a mesh that takes no notice of the seed, move as incompressible tissue there
-    would: the cube of the distance grows by R^3 - r0^3.
+    In a mesh that does not follow the seed, nodes are beside its surface. They move as incompressible tissue does: the
+    cube of the distance from the centre grows by R^3 - r0^3.
     """
     cubed = ((points - centre) ** 2).sum(axis=1) ** 1.5
     grown = np.cbrt(cubed + sphere_radius(volume) ** 3 - seed_radius**3)
@@ -33,7 +33,7 @@ def growth(
 
 
 def rotation_path(points: NDArray[np.float64], rotation: Rotation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Displacements (n, 3), m at full load, of points (n, 3) that are rotated, and their paths (n, 3, 3).
+    """Displacements (n, 3), m at full load, of rotated points (n, 3), m, and their paths (n, 3, 3).
 
     The last axis of the paths is, for each direction, the angle phi in rad, the arm r from the axis and e x r, both in
     m: at the share d of the load the displacement is (cos(d phi) - 1) r + sin(d phi) e x r.

@@ -13,10 +13,10 @@ from mpitled.meshing import label_image
 
 
 def assign_materials(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int16], tuple[Material, ...]]:
-    """Material (n_cells,) of each cell, and the materials: those that the deck names, then those of the mesh file.
+    """Material (n_cells,) of each cell, and all materials: first of the deck, then of the mesh file.
 
-    "all" fills the cells that no other set of the deck claims. The remaining cells take the materials of the mesh
-    file; materials without cells are dropped. Ventricles that the deck leaves out need no material, and may have one.
+    "all" in the deck means the cells that no other set of the deck has. The remaining cells have the materials of the
+    mesh file; materials without cells are dropped. The deck may name a material for ventricles that do not exist.
     InputError if a cell has two materials or none.
     """
     absent = {name for name in label_image.VENTRICLES if deck.labels and not getattr(deck.labels, name)}
@@ -27,12 +27,12 @@ def assign_materials(deck: Deck, mesh: Mesh) -> tuple[NDArray[np.int16], tuple[M
     def fill(name: str, material: Material, origin: str, open_cells: NDArray[np.bool_]) -> None:
         cells = np.arange(mesh.n_cells) if name == "all" else named_set(mesh.cell_sets, name, origin)
         cells = cells[open_cells[cells]]
-        taken = assigned[cells] >= 0
-        if taken.any():
-            twice = materials[assigned[cells].max()].name
+        n_twice = np.count_nonzero(assigned[cells] >= 0)
+        if n_twice:
+            other = materials[assigned[cells].max()].name
             raise InputError(
-                f"{origin}: {np.count_nonzero(taken)} cells of '{name}' are of material '{twice}' already; take them "
-                "out of one of the two"
+                f"{origin}: {n_twice} cells of '{name}' are of material '{other}' already; take them out of one of "
+                "the two"
             )
         assigned[cells] = materials.index(material)
 

@@ -50,7 +50,7 @@ def empty_block(kind: CellKind) -> CellBlock:
 
 @dataclass(frozen=True, slots=True)
 class ModelFigures:
-    """Numbers of a model that were counted or measured when it was built."""
+    """Numbers that were counted or measured while the model was built."""
 
     critical_step_typical_s: float = np.nan  # median of the nodes' critical time steps outside the cloud, if any
     mass_kg: float = np.nan
@@ -58,19 +58,19 @@ class ModelFigures:
     cloud_parts: int = 0
     orphans_removed: int = 0  # EFG nodes without a support domain
     worst_condition: float = 1.0  # of the moving least squares
-    domains_limited: int = 0  # support domains with fewer FE or seed nodes than their nearest nodes hold
+    domains_limited: int = 0  # support domains that do not hold their nearest nodes because of a limit
     memberships_added: int = 0  # to bring nodes into enough support domains
-    domains_repaired: int = 0  # support domains whose fit was singular
-    domains_across: int = 0  # support domains with nodes beyond their own part of the cloud
+    domains_repaired: int = 0  # support domains with a singular or badly conditioned fit
+    domains_across: int = 0  # support domains with nodes outside their part of the cloud
     consistency_before: float | None = None  # largest imbalance of a constant stress, relative; None without a cloud
     consistency_after: float | None = None
     consistency_change: float | None = None  # of the gradients, relative
     of_mesh: dict[str, float] = field(default_factory=dict)  # the mesher's own numbers by name
 
     def flat(self) -> dict[str, float]:
-        """All numbers that there are, by name, those of the mesher first."""
-        own = asdict(self)
-        return own.pop("of_mesh") | {name: value for name, value in own.items() if value is not None}
+        """All numbers by name, first those of the mesher; None is left out."""
+        figures = asdict(self)
+        return figures.pop("of_mesh") | {name: value for name, value in figures.items() if value is not None}
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ class Model:
     cell_sets: dict[str, NDArray[np.int64]]
     surface_areas: NDArray[np.float64] | None = None  # (n_nodes, 3), m^2, as in the mesh: for the export
     figures: ModelFigures = field(default_factory=ModelFigures)
-    remarks: tuple[str, ...] = ()  # what was skipped, merged, repaired or suspicious, a line each
+    remarks: tuple[str, ...] = ()  # one line each: skipped, merged, repaired or suspicious input
 
     @property
     def n_nodes(self) -> int:
@@ -107,12 +107,12 @@ class Model:
         return sum(map(len, self.blocks))
 
     def block(self, name: str) -> CellBlock:
-        """The block of that name; an empty one of the kind of that name if there is none. KeyError."""
+        """The block of that name, or an empty block of the kind of that name; KeyError if there is neither."""
         found = [block for block in self.blocks if block.name == name]
         return found[0] if found else empty_block(KINDS[name])
 
     def numbered(self) -> Iterator[tuple[slice, CellBlock]]:
-        """The blocks, each with the numbers of its cells."""
+        """The range of cell numbers of each block, and the block."""
         first = 0
         for block in self.blocks:
             yield slice(first, first + len(block)), block
@@ -128,27 +128,28 @@ class Model:
         return replace(of_kind[0], name=kind, nodes=nodes, material=material, columns=columns)
 
     def cells_of(self, kind: str) -> NDArray[np.int64]:
-        """Numbers of the cells of a kind, ascending: those of the rows of `of_kind`."""
-        numbers = [np.arange(own.start, own.stop) for own, block in self.numbered() if block.kind.name == kind]
+        """Numbers, ascending, of the cells of a kind, in the order of `of_kind`."""
+        numbers = [np.arange(cells.start, cells.stop) for cells, block in self.numbered() if block.kind.name == kind]
         return np.concatenate([np.empty(0, np.int64), *numbers])
 
     def rows_of(self, kind: str, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Rows of `of_kind` for those of the cells (ascending) that are of the kind."""
+        """Rows of `of_kind` of the cells (ascending) that are of the kind."""
         return np.flatnonzero(np.isin(self.cells_of(kind), cells))
 
     def find_cell(self, cell: int) -> tuple[CellBlock, int]:
-        """The block of a cell, and its row there."""
-        own, block = next((own, block) for own, block in self.numbered() if cell < own.stop)
-        return block, cell - own.start
+        """The block of a cell, and the cell's row in the block."""
+        cells, block = next((cells, block) for cells, block in self.numbered() if cell < cells.stop)
+        return block, cell - cells.start
 
     def at_cells(self, nodal: NDArray[np.float64], at_points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values (n_cells, ...): means of the nodal ones (n_nodes, ...) in solids, `at_points` in mesh-free cells."""
-        values, done = [], 0
+        """Cell values (n_cells, ...): nodal means (n_nodes, ...) in solids, `at_points` in mesh-free cells."""
+        values, first = [], 0
         for block in self.blocks:
-            values.append(
-                at_points[done : done + len(block)] if block.kind.meshfree else nodal[block.nodes].mean(axis=1)
-            )
-            done += len(block) * block.kind.meshfree
+            if block.kind.meshfree:
+                values.append(at_points[first : first + len(block)])
+                first += len(block)
+            else:
+                values.append(nodal[block.nodes].mean(axis=1))
         return np.concatenate(values)
 
     @property
@@ -193,10 +194,10 @@ class Model:
 
     @property
     def warnings(self) -> list[str]:
-        """Remarks that put a result in doubt, without their prefix."""
+        """Warnings among the remarks, without their prefix."""
         return [remark.removeprefix(WARNING) for remark in self.remarks if remark.startswith(WARNING)]
 
     @property
     def notes(self) -> list[str]:
-        """The other remarks."""
+        """Remarks that are no warnings."""
         return [remark for remark in self.remarks if not remark.startswith(WARNING)]

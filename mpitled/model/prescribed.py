@@ -18,7 +18,7 @@ from mpitled.model.scene import OUTER, TUMOUR, members
 
 
 class Prescribed(NamedTuple):
-    """Prescribed dofs, their motion, and the file or key that prescribes each."""
+    """Prescribed dofs and displacements, and their origins."""
 
     dofs: NDArray[np.int64]  # (n,), 3 node + direction, ascending
     displacements: NDArray[np.float64]  # (n,), m at full load
@@ -27,9 +27,9 @@ class Prescribed(NamedTuple):
 
 
 def prescribe(deck: Deck, mesh: Mesh) -> tuple[Prescribed, list[str]]:
-    """The prescribed dofs, and remarks on the constraints of the mesh file that the deck replaces.
+    """The prescribed dofs, and remarks about constraints of the mesh file that the deck replaces.
 
-    InputError if the deck or its files prescribe two displacements of one dof, or nothing at all is prescribed.
+    InputError if the deck or its files prescribe two displacements of one dof, or if nothing is prescribed.
     """
     of_deck = _motions(mesh, deck.constraints())
     if deck.tumour:
@@ -40,19 +40,21 @@ def prescribe(deck: Deck, mesh: Mesh) -> tuple[Prescribed, list[str]]:
     of_files = _motions(mesh, mesh.constraints)
     if not of_deck and not of_files:
         raise InputError(f"{deck.path}: nothing is fixed, displaced or grows; add [[fixed]], [[displaced]] or [tumour]")
-    own, given = (_without_clashes(mesh, motions) for motions in (of_deck, of_files))
-    _, in_own, in_given = np.intersect1d(own.dofs, given.dofs, assume_unique=True, return_indices=True)
-    changed = own.displacements[in_own] != given.displacements[in_given]
+    deck_dofs, file_dofs = (_without_clashes(mesh, motions) for motions in (of_deck, of_files))
+    _, in_deck, in_file = np.intersect1d(deck_dofs.dofs, file_dofs.dofs, assume_unique=True, return_indices=True)
+    changed = deck_dofs.displacements[in_deck] != file_dofs.displacements[in_file]
     replaced: dict[tuple[str, str], set[int]] = {}
-    for new, old in zip(in_own[changed], in_given[changed], strict=True):
-        key, file = own.origins[new].removesuffix(".nodes"), given.origins[old].partition(": line ")[0]
-        replaced.setdefault((key, file), set()).add(int(own.dofs[new]) // 3)
+    for new, old in zip(in_deck[changed], in_file[changed], strict=True):
+        key, file = deck_dofs.origins[new].removesuffix(".nodes"), file_dofs.origins[old].partition(": line ")[0]
+        replaced.setdefault((key, file), set()).add(int(deck_dofs.dofs[new]) // 3)
     remarks = [
         f"{key} replaces what {file} prescribes at {len(nodes)} nodes" for (key, file), nodes in replaced.items()
     ]
-    left = np.ones(len(given.dofs), bool)
-    left[in_given] = False
-    both = [np.concatenate([one, more[left]]) for one, more in zip(own, given, strict=True)]
+    remaining = np.ones(len(file_dofs.dofs), bool)
+    remaining[in_file] = False
+    both = [
+        np.concatenate([of_deck, of_file[remaining]]) for of_deck, of_file in zip(deck_dofs, file_dofs, strict=True)
+    ]
     order = np.argsort(both[0])
     return Prescribed(*(values[order] for values in both)), remarks
 
@@ -79,8 +81,8 @@ _Motion = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], str
 
 
 def _motions(mesh: Mesh, constraints: Iterable[Constraint]) -> list[_Motion]:
-    """Each constraint's motion, direction by direction."""
-    found: list[_Motion] = []
+    """The motion of each constraint in each of its directions."""
+    motions: list[_Motion] = []
     for constraint in constraints:
         nodes = named_set(mesh.node_sets, constraint.node_set, constraint.origin)
         extra, paths = np.zeros((len(nodes), 3)), np.zeros((len(nodes), 3, 3))
@@ -91,12 +93,12 @@ def _motions(mesh: Mesh, constraints: Iterable[Constraint]) -> list[_Motion]:
             extra = extra + carry_over(constraint.field, constraint.field_metre, mesh.points[nodes], key)
         for direction, displacement in zip(constraint.directions, constraint.displacement, strict=True):
             moved = displacement + extra[:, direction]
-            found.append((3 * nodes + direction, moved, paths[:, direction], constraint.origin))
-    return found
+            motions.append((3 * nodes + direction, moved, paths[:, direction], constraint.origin))
+    return motions
 
 
 def _without_clashes(mesh: Mesh, motions: list[_Motion]) -> Prescribed:
-    """All motions together, each dof once. InputError if two displacements of a dof differ."""
+    """All motions as one, with each dof once; InputError if two displacements of a dof differ."""
     origins = np.array([origin for *_, origin in motions], object)
     dofs = np.concatenate([np.empty(0, np.int64), *(dofs for dofs, *_ in motions)])
     moved = np.concatenate([np.empty(0), *(moved for _, moved, *_ in motions)])

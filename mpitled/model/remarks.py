@@ -1,4 +1,4 @@
-"""Warnings of a scene that is possible, but probably not meant."""
+"""Warnings about scenes that are possible, but probably not intended."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from mpitled.meshing.placement import format_length, format_position, unit_hint
 from mpitled.model.loading import sphere_radius
 from mpitled.model.scene import OUTER, TUMOUR, centroids, members
 
-#: Radius of a tumour over its seed's up to which clouds are known to converge, with a margin (jobs/studies/README.md).
+#: Ratio of tumour radius to seed radius up to which clouds converge, with a margin (jobs/studies/README.md).
 MAX_GROWTH = 8.0
-#: Young's modulus of the tissue around a tumour below which it is probably in kPa or MPa, Pa.
+#: Young's modulus, Pa, of the tissue around a tumour; a smaller value is probably in kPa or MPa.
 MIN_MODULUS = 50.0
 #: Poisson's ratio up to which results are validated (jobs/studies/README.md).
 MAX_POISSONS_RATIO = 0.499
-#: Radius of a seed below which it is probably in metres, m, and the largest sensible share of the tumour's volume.
+#: Seed radius, m, below which the deck's value is probably in metres; largest sensible seed volume over tumour volume.
 MIN_SEED_RADIUS, MAX_SEED_SHARE = 5e-5, 0.5
 
 
 def unit_warnings(
     deck: Deck, mesh: Mesh, material: NDArray[np.int16], materials: tuple[Material, ...]
 ) -> Iterator[str]:
-    """Warnings of materials and of a tumour whose numbers look like a wrong unit."""
+    """Warnings about materials and a tumour with numbers that look like a wrong unit."""
     warned = set()
     for section in deck.materials:
         name, solid = f"material.{section.name}", section.material
@@ -54,7 +54,7 @@ def unit_warnings(
 
 
 def unconstrained_warning(mesh: Mesh, dofs: NDArray[np.int64]) -> Iterator[str]:
-    """A warning of a body that only the tumour's own nodes hold in place."""
+    """A warning if only nodes of the tumour are prescribed."""
     seed = members(mesh, TUMOUR)
     names = [name for name in OUTER if name in mesh.node_sets]
     if len(seed) and names and not len(np.setdiff1d(dofs // 3, seed)):
@@ -65,7 +65,7 @@ def unconstrained_warning(mesh: Mesh, dofs: NDArray[np.int64]) -> Iterator[str]:
 
 
 def growth_warnings(deck: Deck) -> Iterator[str]:
-    """Warnings of a tumour that grows more than a cloud is known to allow."""
+    """Warnings about a tumour that grows more than a cloud is known to allow."""
     if deck.tumour is None:
         return
     radius, seed = sphere_radius(deck.tumour.volume), deck.tumour.seed_radius

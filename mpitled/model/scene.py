@@ -1,4 +1,4 @@
-"""The mesh of a deck, and the names of its sets that the model refers to."""
+"""The mesh of a deck, and names of its sets."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from mpitled.mesh import Mesh
 from mpitled.meshing import block, labels, phantoms
 from mpitled.meshing.placement import in_sphere
 
-#: Node set of the surface of the tumour's seed; the meshers make it where there is a tumour.
+#: Node set of the surface of the tumour's seed.
 TUMOUR = "tumour"
-#: Node sets of the outer surface: without tractions a constant stress is not in balance there.
+#: Node sets of the outer surface.
 OUTER = ("skull", "surface")
 
 
 def read_mesh(deck: Deck) -> Mesh:
-    """The mesh of a deck's one geometry section, with the cell sets of its spheres. InputError."""
+    """The mesh of a deck's geometry section, with cell sets for its spheres. InputError if it cannot be meshed."""
     try:
         mesh = _geometry(deck)
     except InputError as error:
@@ -29,14 +29,14 @@ def read_mesh(deck: Deck) -> Mesh:
         raise InputError(f"{deck.path}: {error}") from None
     if not deck.spheres:
         return mesh
-    middles = centroids(mesh)
+    midpoints = centroids(mesh)
     cell_sets = dict(mesh.cell_sets)
     meshed = _meshed_spheres(deck)
     for sphere in deck.spheres:
         origin = f"{deck.path}: sphere.{sphere.name}"
         if sphere.name in cell_sets:
             raise InputError(f"{origin}: there is a cell set of that name already; give it another")
-        inside = in_sphere(middles, sphere)
+        inside = in_sphere(midpoints, sphere)
         for part in mesh.parts if sphere in meshed else ():
             inside[len(mesh.hexahedra) + part.integration_points] = sphere.name in part.spheres
         if not inside.any():
@@ -51,14 +51,14 @@ def members(mesh: Mesh, name: str) -> NDArray[np.int64]:
 
 
 def centroids(mesh: Mesh) -> NDArray[np.float64]:
-    """Positions (n_cells, 3), m, of the middles of hexahedra and of the integration points."""
-    # The middle of a diagonal: the corners of all cells would be the largest array of the build.
+    """Midpoints of hexahedra and positions of integration points, (n_cells, 3), m."""
+    # The middle of one diagonal: the corners of all cells would be the largest array while a model is built.
     of_hexahedra = (mesh.points[mesh.hexahedra[:, 0]] + mesh.points[mesh.hexahedra[:, 6]]) / 2
     return np.concatenate([of_hexahedra, mesh.integration_points])
 
 
 def _meshed_spheres(deck: Deck) -> list[Sphere]:
-    """The spheres with a material of their own: the mesh follows their surfaces."""
+    """The spheres with a separate material: the mesh follows their surfaces."""
     filled = {name for section in deck.materials for name in section.cells if len(deck.materials) > 1}
     return [sphere for sphere in deck.spheres if sphere.name in filled]
 

@@ -1,7 +1,7 @@
 """Abaqus decks (.inp), as Abaqus/CAE, HyperMesh, Cubit, gmsh and CalculiX write them.
 
-Keywords without influence on an elastic solid with prescribed displacements are skipped; a remark lists those that not
-every deck has. Keywords that change the mechanics and cannot be computed are entered in `MeshFile.refused`.
+Keywords without influence on an elastic solid with prescribed displacements are skipped; a remark lists them, except
+output and other common keywords. Keywords that change the mechanics are not supported: see `MeshFile.refused`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mpitled.readers.meshfile import Cells, MeshFile
 from mpitled.readers.text import Block, where
 
 _SOLID = re.compile(r"C3D(\d+)[A-Z]*")
-#: Kind of solid by its number of nodes; "other" where nodes between the corners matter.
+#: Kind of solid by its number of nodes; "other" is not supported because of nodes between the corners.
 _SOLIDS = {
     4: "tetrahedron", 5: "pyramid", 6: "wedge", 8: "hexahedron", 10: "tetrahedron",
     15: "other", 20: "other", 27: "other",
@@ -32,7 +32,7 @@ _HARMLESS = {
     "ENERGYOUTPUT", "NODEPRINT", "ELPRINT", "CONTACTPRINT", "ENERGYPRINT", "NODEFILE", "ELFILE", "CONTACTFILE",
     "FILEFORMAT", "MONITOR",
 }  # fmt: skip
-#: Keywords that tie, load or move parts in ways that cannot be computed, beside CONTACT... and CONNECTOR...
+#: Unsupported keywords that tie, load or move parts, beside CONTACT... and CONNECTOR...
 _REFUSED = {
     "TIE", "MPC", "EQUATION", "COUPLING", "KINEMATICCOUPLING", "DISTRIBUTINGCOUPLING", "RIGIDBODY", "EMBEDDEDELEMENT",
     "SHELLTOSOLIDCOUPLING", "TRANSFORM", "SPRING", "DASHPOT", "MASS", "ROTARYINERTIA", "CONNECTORSECTION",
@@ -43,7 +43,7 @@ _REFUSED = {
 _GENERATING = {
     "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYMMETRICMODELGENERATION", "IMPORT", "SUBSTRUCTUREPROPERTY",
 }  # fmt: skip
-#: Keywords of loads that are left out with a warning.
+#: Keywords of loads, which are ignored with a warning.
 _LOADS = {
     "CLOAD", "DLOAD", "DSLOAD", "TEMPERATURE", "INITIALCONDITIONS", "FOUNDATION", "INERTIARELIEF", "CFLUX", "DFLUX",
 }  # fmt: skip
@@ -69,7 +69,7 @@ def files(path: Path) -> list[Path]:
 
 
 def is_solid(type_name: str) -> bool:
-    """Whether an element of this type is a solid, even one that cannot be computed."""
+    """Whether an element of this type is a solid, supported or not."""
     return bool(_SOLID.fullmatch(type_name.upper()))
 
 
@@ -113,9 +113,7 @@ class _Reader:
         elif name in _GENERATING:
             keyword.fail("generates nodes or elements from others; let the preprocessor write them out")
         elif name in _LOADS:
-            self.found.remarks.append(
-                f"warning: {keyword.origin}: {keyword.shown} is not applied: loads are not supported"
-            )
+            self.found.remarks.append(text.load_warning(keyword))
         elif name in _INELASTIC:
             if self.material:
                 self.material.unusable = self.material.unusable or f"has {keyword.shown} ({keyword.origin})"
@@ -157,10 +155,8 @@ class _Reader:
 
     def _system(self, keyword: Keyword) -> None:
         rows = keyword.numbers(2)
-        values = np.zeros(9)
         given = [value for _, row in rows for value in row][:9]
-        values[: len(given)] = given
-        origin, along, beside = values.reshape(3, 3)
+        origin, along, beside = np.pad(given, (0, 9 - len(given))).reshape(3, 3)
         if not given:
             self.system = None
         elif len(given) <= 3:
@@ -234,9 +230,8 @@ class _Reader:
             return
         for block in keyword.data:
             for line, chunk in block.chunks():
-                found = text.parse(chunk, int, COMMENT)
-                if found:
-                    self.scope.add(kind, name, Entry("labels", found[0], instance, keyword.origin))
+                if numbers := text.parse(chunk, int, COMMENT):
+                    self.scope.add(kind, name, Entry("labels", numbers[0], instance, keyword.origin))
                     continue
                 for at, words in Block.of(block.path, line, chunk).lines(COMMENT):
                     origin = where(block.path, at)
@@ -333,7 +328,7 @@ _HANDLED = {
 
 
 def _transformed(points: Floats, rows: list[tuple[str, list[float]]]) -> Floats:
-    """Points of an instance: the first line of its data is a translation, the second a rotation about an axis."""
+    """Points of an instance: the first row of its data is a translation, the second a rotation about an axis."""
     if rows:
         points = points + np.array([*rows[0][1], 0.0, 0.0, 0.0])[:3]
     if len(rows) > 1:

@@ -1,4 +1,4 @@
-"""The content of an Abaqus deck, resolved: instances, sets by name, surfaces, sections and boundary conditions."""
+"""Resolve the definitions of an Abaqus deck: instances, sets, surfaces, sections and boundary conditions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mpitled.readers.inp import Keyword
 from mpitled.readers.meshfile import Cells, FileMaterial, MeshFile, NodeTable, Numbering
 from mpitled.readers.text import integer, real
 
-#: Degrees of freedom by name.
+#: Degrees of freedom of named boundary conditions.
 _SYMBOLIC = {
     "ENCASTRE": (1, 2, 3), "PINNED": (1, 2, 3), "XSYMM": (1,), "YSYMM": (2,), "ZSYMM": (3,),
     "XASYMM": (2, 3), "YASYMM": (1, 3), "ZASYMM": (1, 2), "NOWARP": (), "NOOVAL": (), "NODEFORM": (),
@@ -39,7 +39,7 @@ class Entry:
 
 @dataclass(slots=True)
 class Set:
-    """A set of nodes or elements as the entries of the deck."""
+    """Entries of a set of nodes or elements."""
 
     name: str  # as first written
     entries: list[Entry] = field(default_factory=list)
@@ -47,11 +47,11 @@ class Set:
 
 @dataclass(slots=True)
 class Scope:
-    """The definitions of a part, of an instance, or of the deck outside of these. Names ignore case."""
+    """The definitions of a part, of an instance, or of the rest of the deck. Names ignore case."""
 
     name: str = ""
     nodes: NodeTable = field(default_factory=NodeTable)
-    cells: list[Cells] = field(default_factory=list)  # with the file's numbers as nodes
+    cells: list[Cells] = field(default_factory=list)  # their nodes are numbers in the file
     sets: dict[str, dict[str, Set]] = field(default_factory=lambda: {"node": {}, "cell": {}})
     surfaces: dict[str, tuple[str, list[tuple[str, list[str]]]]] = field(default_factory=dict)
     sections: list[tuple[str, str, str]] = field(default_factory=list)  # set, material or "", origin
@@ -64,15 +64,15 @@ class Scope:
         """An instance of this part."""
         nodes = NodeTable(list(self.nodes.ids), list(self.nodes.points), list(self.nodes.origins))
         sets = {
-            kind: {key: Set(members.name, list(members.entries)) for key, members in several.items()}
-            for kind, several in self.sets.items()
+            kind: {key: Set(members.name, list(members.entries)) for key, members in of_kind.items()}
+            for kind, of_kind in self.sets.items()
         }
         return Scope(name, nodes, list(self.cells), sets, dict(self.surfaces), list(self.sections))
 
 
 @dataclass(slots=True)
 class Placed:
-    """A scope in the model: the rows of its first node and element, and their numbers."""
+    """A scope in the model: rows of its first node and element, and the maps from numbers to rows."""
 
     scope: Scope
     node_offset: int
@@ -89,7 +89,7 @@ class Material:
     origin: str
     elastic: tuple[float, float] | None = None
     density: float | None = None
-    unusable: str = ""  # the reason, if another law is asked for
+    unusable: str = ""  # the reason, if the law is not supported
 
 
 @dataclass(slots=True)
@@ -104,24 +104,24 @@ class Definitions:
     assembly: str = ""  # its name
     unended: str = ""  # the part or instance without an end
     materials: dict[str, Material] = field(default_factory=dict)
-    boundaries: list[tuple[int, Keyword]] = field(default_factory=list)  # with the step of each, from 1
+    boundaries: list[tuple[int, Keyword]] = field(default_factory=list)  # step from 1, *BOUNDARY
     remarks: list[str] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
 
 
 def _with_rows(block: Cells, numbering: Numbering, offset: int) -> Cells:
-    """Elements with rows of the model's nodes instead of numbers. Missing nodes are errors in solids only."""
+    """Elements with rows of the model's nodes instead of numbers; InputError if a node of a solid is missing."""
     if block.kind != "other":
         nodes = numbering.resolve(block.nodes, block.ids, block.origin)
         nodes += offset
     else:
-        rows, found = numbering.rows(block.nodes)
-        nodes = np.where(found, rows + offset, -1)
+        rows, exists = numbering.rows(block.nodes)
+        nodes = np.where(exists, rows + offset, -1)
     return Cells(block.kind, block.type, block.ids, nodes, block.origin)
 
 
 class Model:
-    """The instances of all parts, and all names resolved."""
+    """The instances of all parts, with resolved names."""
 
     def __init__(self, given: Definitions) -> None:
         self.given = given
@@ -136,18 +136,18 @@ class Model:
         }
         given.parts.clear()  # the instances have copies
         for key, scope in {"": given.root, **given.instances}.items():
-            own_ids, own_points = scope.nodes.merged(given.path, self.remarks)
+            scope_ids, scope_points = scope.nodes.merged(given.path, self.remarks)
             scope.nodes = NodeTable()  # frees memory
             meshfile.check_unique_cells(scope.cells)
-            own_cells = meshfile.joined(block.ids for block in scope.cells)
-            placed = Placed(scope, n_nodes, n_cells, Numbering(own_ids), Numbering(own_cells))
+            cell_ids = meshfile.joined(block.ids for block in scope.cells)
+            placed = Placed(scope, n_nodes, n_cells, Numbering(scope_ids), Numbering(cell_ids))
             self.placed[key] = placed
             for at, block in enumerate(scope.cells):
                 cells.append(_with_rows(block, placed.nodes, n_nodes))
                 scope.cells[at] = cells[-1]  # frees the numbers
-            points.append(own_points)
-            ids.append(own_ids)
-            n_nodes, n_cells = n_nodes + len(own_ids), n_cells + len(own_cells)
+            points.append(scope_points)
+            ids.append(scope_ids)
+            n_nodes, n_cells = n_nodes + len(scope_ids), n_cells + len(cell_ids)
         unused = {name: n for name, n in unused.items() if n}
         ends = f"the file ends within {given.unended}: is it cut short?" if given.unended else ""
         if unused and not n_nodes:
@@ -167,26 +167,26 @@ class Model:
             remarks=self.remarks,
             refused=given.refused,
         )
-        self._found: dict[_Key, Ints] = {}
+        self._resolved: dict[_Key, Ints] = {}
 
     def file(self) -> MeshFile:
         """The mesh with all sets, materials and constraints."""
         mesh = self.mesh
         names: dict[_Key, str] = {}  # names of sets in the result
         for kind, sets in (("node", mesh.node_sets), ("cell", mesh.cell_sets)):
-            all_names = [key for place in self.placed.values() for key in place.scope.sets[kind]]
-            for key, place in self.placed.items():
-                for wanted, members in place.scope.sets[kind].items():
-                    alone = key == "" or all_names.count(wanted) == 1
-                    name = members.name if alone else f"{place.scope.name}.{members.name}"
-                    names[key, kind, wanted] = meshfile.add_set(sets, name, self._members(key, kind, wanted, ()))
-        for key, place in self.placed.items():
-            for name, (kind, rows) in place.scope.surfaces.items():
-                alone = key == "" or sum(name in other.scope.surfaces for other in self.placed.values()) == 1
-                shown = name if alone else f"{place.scope.name}.{name}"
-                shown = f"{shown}_surface" if shown in mesh.node_sets else shown
-                meshfile.add_set(mesh.node_sets, shown, self._surface(key, kind, rows))
-            for name, material, origin in place.scope.sections:
+            all_names = [key for placed in self.placed.values() for key in placed.scope.sets[kind]]
+            for key, placed in self.placed.items():
+                for set_key, members in placed.scope.sets[kind].items():
+                    unique = key == "" or all_names.count(set_key) == 1
+                    name = members.name if unique else f"{placed.scope.name}.{members.name}"
+                    names[key, kind, set_key] = meshfile.add_set(sets, name, self._members(key, kind, set_key, ()))
+        for key, placed in self.placed.items():
+            for name, (kind, rows) in placed.scope.surfaces.items():
+                unique = key == "" or sum(name in other.scope.surfaces for other in self.placed.values()) == 1
+                name = name if unique else f"{placed.scope.name}.{name}"
+                name = f"{name}_surface" if name in mesh.node_sets else name
+                meshfile.add_set(mesh.node_sets, name, self._surface(key, kind, rows))
+            for name, material, origin in placed.scope.sections:
                 self._section(names, key, name, material, origin)
         self._constrain(names)
         return mesh
@@ -194,14 +194,15 @@ class Model:
     # Sets
 
     def _members(self, key: str, kind: str, name: str, within: tuple[_Key, ...]) -> Ints:
-        """Rows, ascending, of the set `name` of a scope."""
-        at = key, kind, name
-        if at not in self._found:
+        """Rows, ascending, of the set `name` of a scope; `within` are the sets that refer to it."""
+        set_key = key, kind, name
+        if set_key not in self._resolved:
             entries = self.placed[key].scope.sets[kind][name].entries
-            if at in within:
+            if set_key in within:
                 raise InputError(f"{entries[0].origin}: set {name} is a part of itself; break the circle")
-            self._found[at] = meshfile.union(self._entry(key, kind, name, entry, (*within, at)) for entry in entries)
-        return self._found[at]
+            within = (*within, set_key)
+            self._resolved[set_key] = meshfile.union(self._entry(key, kind, name, entry, within) for entry in entries)
+        return self._resolved[set_key]
 
     def _entry(self, key: str, kind: str, name: str, entry: Entry, within: tuple[_Key, ...]) -> Ints:
         if entry.instance is not None:
@@ -218,22 +219,22 @@ class Model:
         return offset + numbering.members(entry.value, _NOUN[kind], name, entry.origin, self.remarks)
 
     def _numbering(self, key: str, kind: str) -> tuple[Numbering, int]:
-        place = self.placed[key]
-        return (place.nodes, place.node_offset) if kind == "node" else (place.cells, place.cell_offset)
+        placed = self.placed[key]
+        return (placed.nodes, placed.node_offset) if kind == "node" else (placed.cells, placed.cell_offset)
 
     def _refer(self, key: str, kind: str, text: str, origin: str, within: tuple[_Key, ...] = ()) -> Ints:
-        """Rows of a number or a set in a line of data, perhaps one of an instance, as in Part-1-1.Set-1."""
-        place = self._locate(key, kind, text)
-        if place is None:
+        """Rows of a number or a set in a line of data, also of an instance's set, for example Part-1-1.Set-1."""
+        located = self._locate(key, kind, text)
+        if located is None:
             sets = sorted(members.name for members in self.placed[key].scope.sets[kind].values())
             raise InputError(f"{origin}: there is no {_NOUN[kind]} set {text}; sets: {meshfile.listed(sets)}")
-        key, name = place
+        key, name = located
         if isinstance(name, str):
             return self._members(key, kind, name, within)
         meshfile.checked_ids(np.array([name]), kind, origin)
         numbering, offset = self._numbering(key, kind)
-        rows, found = numbering.rows(np.array([name]))
-        if not found.all():
+        rows, exists = numbering.rows(np.array([name]))
+        if not exists.all():
             raise InputError(f"{origin}: there is no {_NOUN[kind]} {text}; correct it")
         return offset + rows
 
@@ -242,9 +243,9 @@ class Model:
         if text.isascii() and text.isdecimal() and len(text) <= 20:
             return key, int(text)
         text = text.strip().strip('"')
-        wanted = text.casefold()
-        if wanted in self.placed[key].scope.sets[kind]:
-            return key, wanted
+        set_key = text.casefold()
+        if set_key in self.placed[key].scope.sets[kind]:
+            return key, set_key
         if key == "":
             for dot in (at for at, letter in enumerate(text) if letter == "."):
                 instance, rest = text[:dot].strip().strip('"').casefold(), text[dot + 1 :]
@@ -252,21 +253,21 @@ class Model:
                     return self._locate(instance, kind, rest)
                 if instance == self.given.assembly.casefold():
                     return self._locate("", kind, rest)
-            owners = [other for other, place in self.placed.items() if wanted in place.scope.sets[kind]]
+            owners = [other for other, placed in self.placed.items() if set_key in placed.scope.sets[kind]]
             if len(owners) == 1:
-                return owners[0], wanted
+                return owners[0], set_key
         return None
 
     def _surface(self, key: str, kind: str, rows: list[tuple[str, list[str]]]) -> Ints:
         """Nodes of a surface: of nodes, of elements' faces, or of all exterior faces of elements."""
-        found: list[Ints] = []
+        parts: list[Ints] = []
         exterior = None
         by_face: dict[int | None, list[Ints]] = {}
         for origin, fields in rows:
             if not fields[0]:
                 raise InputError(f"{origin}: a surface of the whole model is not read; name an element set")
             if kind == "NODE":
-                found.append(self._refer(key, "node", fields[0], origin))
+                parts.append(self._refer(key, "node", fields[0], origin))
                 continue
             name = fields[1].upper() if len(fields) > 1 else ""
             face = int(name[1:]) - 1 if re.fullmatch(r"S[1-6]", name) else None
@@ -276,37 +277,37 @@ class Model:
                 continue
             if exterior is None:
                 exterior = meshfile.exterior_faces(self.mesh.cells)
-            found.append(np.unique(exterior[0][np.isin(exterior[1], cells)]))
-        found += [self.mesh.nodes_of(meshfile.union(cells), face) for face, cells in by_face.items()]
-        nodes = meshfile.union(found)
+            parts.append(np.unique(exterior[0][np.isin(exterior[1], cells)]))
+        parts += [self.mesh.nodes_of(meshfile.union(cells), face) for face, cells in by_face.items()]
+        nodes = meshfile.union(parts)
         return nodes[nodes >= 0]
 
     # Sections and boundary conditions
 
     def _section(self, names: dict[_Key, str], key: str, name: str, material: str, origin: str) -> None:
-        place = self._locate(key, "cell", f'"{name}"')
-        if place is None or not isinstance(place[1], str):
+        located = self._locate(key, "cell", f'"{name}"')
+        if located is None or not isinstance(located[1], str):
             self._refer(key, "cell", f'"{name}"', origin)
             raise InputError(f"{origin}: a section needs an element set, not {name!r}; correct it")
-        published = names[place[0], "cell", place[1]]
-        self.mesh.structural.add(published)
+        cell_set = names[located[0], "cell", located[1]]
+        self.mesh.structural.add(cell_set)
         if not material:
             return
         if material.casefold() not in self.given.materials:
-            known = meshfile.listed(found.name for found in self.given.materials.values())
+            known = meshfile.listed(law.name for law in self.given.materials.values())
             raise InputError(f"{origin}: there is no material {material!r}; materials: {known}")
         law = self.given.materials[material.casefold()]
         reason = law.unusable or (meshfile.invalid_moduli(*law.elastic) if law.elastic else "has no *ELASTIC")
         if reason or law.elastic is None:
-            self.remarks.append(meshfile.unused_material(law.origin, law.name, reason, published))
+            self.remarks.append(meshfile.unused_material(law.origin, law.name, reason, cell_set))
             return
-        self.mesh.materials.append((published, FileMaterial(law.name, *law.elastic, law.density, law.origin)))
+        self.mesh.materials.append((cell_set, FileMaterial(law.name, *law.elastic, law.density, law.origin)))
 
     def _constrain(self, names: dict[_Key, str]) -> None:
-        """The boundary conditions at the end of the last step: later steps replace earlier ones node by node."""
+        """Boundary conditions at the end of the last step: later steps replace earlier steps node by node."""
         constraints: list[tuple[int, Constraint, Ints]] = []
         for step, keyword in self.given.boundaries:
-            constraints += [(step, *found) for found in self._boundary(names, keyword)]
+            constraints += [(step, constraint, nodes) for constraint, nodes in self._boundary(names, keyword)]
         claimed = np.zeros((len(self.mesh.points), 3), bool)
         last = max((step for step, _, _ in constraints), default=0)
         kept: list[Constraint] = []
@@ -321,8 +322,7 @@ class Model:
                 replaced = True
                 for i, direction in enumerate(constraint.directions):
                     if free[:, i].any():
-                        rest = nodes[free[:, i]]
-                        name = self.mesh.set_of(rest, f"{constraint.node_set} before step {last}")
+                        name = self.mesh.set_of(nodes[free[:, i]], f"{constraint.node_set} before step {last}")
                         values = constraint.displacement[i]
                         if isinstance(values, np.ndarray):
                             values = values[free[:, i]]
@@ -341,9 +341,9 @@ class Model:
             directions, value = self._degrees(origin, fields, keyword)
             if not directions:
                 continue
-            place = self._locate("", "node", fields[0])
-            if place is not None and isinstance(place[1], str):
-                of_sets.setdefault(place, []).extend((direction, value, origin) for direction in directions)
+            located = self._locate("", "node", fields[0])
+            if located is not None and isinstance(located[1], str):
+                of_sets.setdefault(located, []).extend((direction, value, origin) for direction in directions)
                 continue
             node = self._refer("", "node", fields[0], origin)
             for direction in directions:
@@ -351,11 +351,10 @@ class Model:
                 nodes.append(node)
                 values.append(value)
         for (key, name), moved in of_sets.items():
-            published = names[key, "node", str(name)]
-            nodes_of_set = self.mesh.node_sets[published]
+            node_set = names[key, "node", str(name)]
             for group in _without_clashes({(direction, value): origin for direction, value, origin in moved}):
                 axes, moves = zip(*group, strict=True)
-                yield Constraint(published, axes, moves, group[axes[0], moves[0]]), nodes_of_set
+                yield Constraint(node_set, axes, moves, group[axes[0], moves[0]]), self.mesh.node_sets[node_set]
         grouped: dict[bytes, tuple[Ints, dict[int, Any]]] = {}
         for direction, (nodes, values) in of_nodes.items():
             for rows, at in _distinct(np.concatenate(nodes), np.array(values)):
@@ -367,7 +366,7 @@ class Model:
             yield Constraint(name, axes, moves, keyword.origin), rows
 
     def _degrees(self, origin: str, fields: list[str], keyword: Keyword) -> tuple[tuple[int, ...], float]:
-        """Directions (0, 1, 2) and displacement in a line of *BOUNDARY; rotations and temperatures are left out."""
+        """Directions (0, 1, 2) and displacement in a line of *BOUNDARY, without rotations and temperatures."""
         if len(fields) < 2 or not fields[1]:
             raise InputError(f"{origin}: {keyword.shown} needs a node or set, and degrees of freedom; correct it")
         word = "".join(fields[1].split()).upper()
@@ -391,7 +390,7 @@ def _without_clashes(moved: dict[tuple[int, float], str]) -> list[dict[tuple[int
 
 
 def _distinct(rows: Ints, values: Floats) -> Iterator[tuple[Ints, Floats]]:
-    """Rows, ascending and each once, with their values; rows with a second value follow as a separate pair."""
+    """Distinct rows, ascending, with their values; rows with a second value follow as a separate pair."""
     order = np.lexsort((values, rows))
     rows, values = rows[order], values[order]
     while len(rows):

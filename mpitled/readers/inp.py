@@ -1,10 +1,11 @@
-"""The text of Abaqus decks: keywords with their parameters and data, including all files that they include."""
+"""The text of Abaqus decks: keywords with parameters and data, from the deck and all its includes."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 
 from mpitled.errors import InputError
@@ -20,7 +21,7 @@ class Keyword(KeywordLine):
     """A keyword line with its parameters, and the data below it."""
 
     text: str  # the keyword as written, with its asterisk
-    parameters: dict[str, str]  # names in capitals, without blanks
+    parameters: dict[str, str]  # names in upper case, without blanks
     data: list[Block] = field(default_factory=list)
 
     @property
@@ -42,16 +43,14 @@ class Keyword(KeywordLine):
 
     def numbers(self, most: int) -> list[tuple[str, list[float]]]:
         """Origin and numbers of the first `most` lines of data; an empty field is 0."""
-        found: list[tuple[str, list[float]]] = []
-        for origin, entries in self.rows():
-            found.append((origin, [real(entry, origin) if entry else 0.0 for entry in entries]))
-            if len(found) == most:
-                break
-        return found
+        return [
+            (origin, [real(entry, origin) if entry else 0.0 for entry in entries])
+            for origin, entries in islice(self.rows(), most)
+        ]
 
 
 def collect(path: Path, home: Path, found: list[Keyword], within: tuple[Path, ...], opened: list[Path]) -> None:
-    """Append the keywords of a file and its includes, in the order of the text, and the files that were opened."""
+    """Append the keywords of a file and its includes to `found`, in text order, and the files to `opened`."""
     text = read_text(path, _KIND)
     opened.append(path)
     within = (*within, path.resolve())
@@ -98,7 +97,7 @@ def _add_data(found: list[Keyword], path: Path, line: int, text: bytes, start: i
 
 
 def _keyword(path: Path, line: int, text: bytes, begin: int) -> tuple[Keyword, int]:
-    """The keyword of the line that begins there, and the start of its data. A comma at the end continues the line."""
+    """The keyword at text[begin:], and the start of its data. A comma at the end of a line continues the keyword."""
     end = text.find(b"\n", begin) + 1 or len(text)
     words = decode(text[begin:end]).strip()
     while words.endswith(","):

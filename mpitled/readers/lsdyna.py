@@ -7,7 +7,7 @@ Keywords that change the mechanics and cannot be computed are entered in `MeshFi
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -55,7 +55,7 @@ class _Keyword(KeywordLine):
         return list(self.data.lines(COMMENT))
 
     def split_title(self) -> tuple[str, list[tuple[int, str]]]:
-        """The title, if the keyword has one, and the lines below it; InputError without lines."""
+        """The title ("" without the option TITLE) and the lines below it; InputError without lines."""
         lines = self.lines()
         title = lines.pop(0)[1].strip() if "_TITLE" in self.name and lines else ""
         if not lines:
@@ -63,12 +63,12 @@ class _Keyword(KeywordLine):
         return title, lines
 
     def without(self, *options: str) -> tuple[str, set[str]]:
-        """The name without these options at its end, and the options that it had."""
-        name, found = self.name, set()
+        """The name without these options at its end, and the removed options."""
+        name, removed = self.name, set()
         while (option := name.rpartition("_")[2]) in options:
             name = name.removesuffix(f"_{option}")
-            found.add(option)
-        return name, found
+            removed.add(option)
+        return name, removed
 
 
 @dataclass(slots=True)
@@ -96,9 +96,6 @@ class _Card:
     def real(self, i: int, default: float = 0.0) -> float:
         entry = self.text(i)
         return text.real(entry, self.origin) if entry else default
-
-    def integers(self) -> list[int]:
-        return [self.integer(i) for i in range(len(self.fields))]
 
 
 @dataclass(slots=True)
@@ -146,14 +143,14 @@ def _keywords(
         end = min(data.find(b"\n", begin) + 1 or len(data), stop)
         words = decode(data[begin + 1 : end]).split()
         name = words[0].upper() if words else ""
-        own = layout
+        keyword_format = layout
         if name[-1:] in _FORMAT or (len(words) > 1 and words[1] in _FORMAT):
-            own = _FORMAT[name[-1] if name[-1] in _FORMAT else words[1]]
+            keyword_format = _FORMAT[name[-1] if name[-1] in _FORMAT else words[1]]
             name = name.rstrip("+-%")
         if name.startswith("KEYWORD"):
             options = "".join(words).upper()
             layout = "long" if "LONG=Y" in options else "i10" if "I10=Y" in options else layout
-        keyword = _Keyword(name, path, line, own, Block(path, line + 1, data, end, stop))
+        keyword = _Keyword(name, path, line, keyword_format, Block(path, line + 1, data, end, stop))
         if name == "END":
             return
         if name in ("INCLUDE_PATH", "INCLUDE_PATH_RELATIVE"):
@@ -215,26 +212,9 @@ class _Reader:
 
     def _handle(self, keyword: _Keyword) -> None:
         name = keyword.name
-        if name == "NODE":
-            self._node(keyword)
-        elif name == "ELEMENT_SOLID":
-            self._solid(keyword)
-        elif name.startswith(("ELEMENT_SHELL", "ELEMENT_BEAM", "ELEMENT_TSHELL")):
-            self._other(keyword)
-        elif name.startswith(("SET_NODE", "SET_SOLID", "SET_PART")):
-            self._set(keyword)
-        elif name == "PART" or name.startswith("PART_"):
-            self._part(keyword)
-        elif name.startswith("MAT_"):
-            self._material(keyword)
-        elif name.startswith("BOUNDARY_SPC_") and "SYMMETRY" not in name:
-            self._prescribed(keyword, "BOUNDARY_SPC")
-        elif name.startswith("BOUNDARY_PRESCRIBED_MOTION_"):
-            self._prescribed(keyword, "BOUNDARY_PRESCRIBED_MOTION")
-        elif name in ("DEFINE_CURVE", "DEFINE_CURVE_TITLE"):
-            self._curve(keyword)
-        elif name in ("PARAMETER", "PARAMETER_LOCAL"):
-            self._parameters(keyword)
+        handler = next((handler for pattern, handler in _HANDLERS.items() if re.fullmatch(pattern, name)), None)
+        if handler:
+            handler(self, keyword)
         elif name.startswith(_REFUSED):
             self.refused.append(f"{keyword.origin}: *{name} changes the mechanics and cannot be computed")
         elif name.startswith(_GENERATING):
@@ -244,9 +224,9 @@ class _Reader:
         elif not name.startswith(("KEYWORD", "TITLE", "COMMENT", "END", "DATABASE_", "CONTROL_TERMINATION")):
             self.skipped[f"*{name}"] = None
 
-    def _cards(self, keyword: _Keyword, widths: list[int] | None = None) -> Iterator[_Card]:
+    def _cards(self, keyword: _Keyword) -> Iterator[_Card]:
         for line, words in keyword.lines():
-            yield self._card(keyword, line, words, widths)
+            yield self._card(keyword, line, words)
 
     def _card(self, keyword: _Keyword, line: int, words: str, widths: list[int] | None = None) -> _Card:
         origin = where(keyword.path, line)
@@ -262,16 +242,15 @@ class _Reader:
 
     def _rows(self, keyword: _Keyword, widths: list[list[int]], dtype: type[int] | type[float]) -> NDArray[np.float64]:
         """Numbers (n_rows, n_fields) of all lines; a row has a line for each list of widths, and blanks are 0."""
-        found = [np.empty((0, sum(map(len, widths))), dtype)]
+        parts = [np.empty((0, sum(map(len, widths))), dtype)]
         pending: list[_Card] = []
         for line, chunk in keyword.data.chunks():
             plain = re.sub(rb"(?m)^(\$.*|[ \t\r]*)\n", b"", chunk) if b"$" in chunk or b"\n\n" in chunk else chunk
-            at_once = None
             if not pending and plain.strip() and not any(mark in plain for mark in (b",", b"&", b"\t")):
-                at_once = text.columns(plain, widths, dtype)
-            if at_once is not None:
-                found.append(at_once)
-                continue
+                in_bulk = text.columns(plain, widths, dtype)
+                if in_bulk is not None:
+                    parts.append(in_bulk)
+                    continue
             rows: list[list[float]] = []
             for at, words in Block.of(keyword.path, line, chunk).lines(COMMENT):
                 pending.append(self._card(keyword, at, words, widths[len(pending)]))
@@ -283,10 +262,10 @@ class _Reader:
                     rows.append(row)
                     pending = []
             if rows:
-                found.append(text.as_array(rows, dtype, where(keyword.path, line)))
+                parts.append(text.as_array(rows, dtype, where(keyword.path, line)))
         if pending:
             raise InputError(f"{pending[0].origin}: the last row of *{keyword.name} is not complete")
-        return np.concatenate(found)
+        return np.concatenate(parts)
 
     def _node(self, keyword: _Keyword) -> None:
         rows = self._rows(keyword, [_NODE[keyword.format]], float)
@@ -317,12 +296,13 @@ class _Reader:
         self.solids.append((np.concatenate([rows[:, :1], nodes[:, :8]], axis=1), rows[:, 1].copy(), keyword.origin))
 
     def _other(self, keyword: _Keyword) -> None:
-        """Shells and beams: only their nodes are read. Cards that options add have no integers."""
+        """Shells and beams: only their nodes are read. Additional cards of options are no integers and are skipped."""
         width = _SOLID[keyword.format]
         rows = []
         for line, words in keyword.lines():
             try:
-                rows.append((self._card(keyword, line, words, width).integers() + [0] * 10)[:6])
+                card = self._card(keyword, line, words, width)
+                rows.append(([card.integer(i) for i in range(len(card.fields))] + [0] * 10)[:6])
             except InputError:
                 continue
         if rows:
@@ -331,66 +311,53 @@ class _Reader:
     def _set(self, keyword: _Keyword) -> None:
         name, _ = keyword.without("TITLE", "COLLECT")
         kind = {"NODE": "node", "SOLI": "cell", "PART": "part"}[name[4:8]]
-        option = name.split("_", 2)[2].removeprefix("LIST_") if name.count("_") > 1 else "LIST"
+        set_option = name.split("_", 2)[2].removeprefix("LIST_") if name.count("_") > 1 else "LIST"
+        general = set_option == "GENERAL"  # each card has its own option in the first field
         title, lines = keyword.split_title()
         card = self._card(keyword, *lines[0])
         number = card.integer(0)
         if not 0 < number <= meshfile.MAX_ID:
             raise InputError(f"{card.origin}: {number} is not a valid number of a set; correct it")
-        chosen = self.sets[kind].setdefault(number, _Set(title or str(number), keyword.origin))
+        members = self.sets[kind].setdefault(number, _Set(title or str(number), keyword.origin))
         for line, words in lines[1:]:
             card = self._card(keyword, line, words)
-            if option == "GENERAL":
-                self._general(keyword, card, chosen)
+            option = card.text(0).upper() if general else set_option
+            if general and option == "ALL":
+                members.everything = True
                 continue
-            values = card.integers()[: 1 if option == "COLUMN" else None]
-            if option == "GENERATE":
+            values = [card.integer(i) for i in range(general, len(card.fields))]
+            if option in ("LIST", "COLUMN", "SMOOTH", "NODE", "ELEM"):
+                members.labels.append(_labels(values[: 1 if option == "COLUMN" else None], card))
+            elif option == "GENERATE":
                 for first, last in zip(values[0::2], values[1::2], strict=False):
-                    self._range(card, chosen, first, last, 1)
+                    self._range(card, members, first, last, 1)
             elif option == "GENERATE_INCREMENT":
-                self._range(card, chosen, *[*values, 0, 0, 1][:3])
-            elif option in ("LIST", "COLUMN", "SMOOTH"):
-                chosen.labels.append(_labels(values, card))
-            elif option == "ADD":
-                chosen.sets += [value for value in values if value]
+                self._range(card, members, *[*values, 0, 0, 1][:3])
+            elif option == "PART":
+                members.parts += [value for value in values if value]
+            elif option in ("ADD", "SET_NODE", "SET_SOLID", "SET"):
+                members.sets += [value for value in values if value]
             else:
-                self._not_read(keyword, chosen, option)
-                return
-
-    def _not_read(self, keyword: _Keyword, chosen: _Set, option: str) -> None:
-        self.remarks.append(
-            f"warning: {keyword.origin}: *{keyword.name} selects by {option}, which is not read; set {chosen.name} "
-            "may lack members"
-        )
+                self.remarks.append(
+                    f"warning: {keyword.origin}: *{keyword.name} selects by {option}, which is not read; set "
+                    f"{members.name} may lack members"
+                )
+                if not general:
+                    return
 
     @staticmethod
-    def _range(card: _Card, chosen: _Set, first: int, last: int, step: int) -> None:
+    def _range(card: _Card, members: _Set, first: int, last: int, step: int) -> None:
         if first == last == 0:
             return
         if not 0 < first <= last <= meshfile.MAX_ID or step < 1:
             raise InputError(f"{card.origin}: {first} to {last} by {step} is no range of numbers; correct it")
-        chosen.ranges.append((first, last, step))
-
-    def _general(self, keyword: _Keyword, card: _Card, chosen: _Set) -> None:
-        option = card.text(0).upper()
-        if option == "ALL":
-            chosen.everything = True
-            return
-        values = [value for value in (card.integer(i) for i in range(1, len(card.fields))) if value]
-        if option in ("NODE", "ELEM"):
-            chosen.labels.append(_labels(values, card))
-        elif option == "PART":
-            chosen.parts += values
-        elif option in ("SET_NODE", "SET_SOLID", "SET"):
-            chosen.sets += values
-        else:
-            self._not_read(keyword, chosen, option)
+        members.ranges.append((first, last, step))
 
     def _part(self, keyword: _Keyword) -> None:
-        """Title and numbers of each part. Options add further cards; then only the first part is read."""
+        """Title and numbers of each part. If options add cards, only the first part is read."""
         lines = keyword.lines()
         if len(lines) < 2:
-            # `lines` leaves out blank lines, and an empty title is one.
+            # `lines` skips an empty title as a blank line.
             lines = [(keyword.line + 1, ""), *lines]
         pairs = zip(lines[0::2], lines[1::2], strict=False) if keyword.name == "PART" else [(lines[0], lines[1])]
         for title, numbers in pairs:
@@ -413,20 +380,17 @@ class _Reader:
 
     # Constraints
 
-    def _prescribed(self, keyword: _Keyword, stem: str) -> None:
+    def _prescribed(self, keyword: _Keyword) -> None:
         name, options = keyword.without("ID")
+        stem = "BOUNDARY_SPC" if name.startswith("BOUNDARY_SPC") else "BOUNDARY_PRESCRIBED_MOTION"
         if name not in (f"{stem}_SET", f"{stem}_NODE"):
             self.refused.append(f"{keyword.origin}: *{keyword.name} is not read; use *{stem}_SET")
             return
-        for card in self._identified(keyword, "ID" in options):
-            self.prescribed.append((keyword, card, name.endswith("NODE")))
-
-    def _identified(self, keyword: _Keyword, with_id: bool) -> Iterator[_Card]:
-        """The cards without those with a number and a heading only."""
         for i, card in enumerate(self._cards(keyword)):
+            # With the option ID, cards with a number and a heading precede the data.
             heading = len(card.fields) > 1 and not re.fullmatch(r"[\s\d+.&-]*", card.fields[1])
-            if not (with_id and (i == 0 or heading or len(card.fields) < 2)):
-                yield card
+            if not ("ID" in options and (i == 0 or heading or len(card.fields) < 2)):
+                self.prescribed.append((keyword, card, name.endswith("NODE")))
 
     def _curve(self, keyword: _Keyword) -> None:
         _, lines = keyword.split_title()
@@ -453,10 +417,9 @@ class _Reader:
     def _file(self) -> MeshFile:
         ids, points = self.nodes.merged(self.path, self.remarks)
         mesh = MeshFile(self.path, "LS-DYNA", points, ids, remarks=self.remarks, refused=self.refused)
-        self.numbering = {"node": Numbering(ids)}
-        part_of = self._elements(mesh)
+        self.mesh, self.numbering = mesh, {"node": Numbering(ids)}
+        self.part_of = self._elements(mesh)
         self.numbering["cell"] = Numbering(meshfile.joined(b.ids for b in mesh.cells if b.kind != "other"))
-        self.mesh, self.part_of = mesh, part_of
         self._name_sets()
         for nodes, code, origin in self.fixed:
             rows = np.unique(self.numbering["node"].rows(nodes)[0])
@@ -472,24 +435,24 @@ class _Reader:
         for rows, part, origin in self.solids:
             nodes, kinds = rows[:, 1:], _kinds(rows[:, 1:])
             for row, (kind, corners) in enumerate(_CORNERS.items()):
-                chosen = kinds == row
-                if chosen.any():
-                    # A view, not a copy, where all are of one kind.
-                    some = slice(None) if chosen.all() else chosen
-                    labels = nodes[some] if kind == "hexahedron" else nodes[some][:, corners]
-                    numbers = rows[some, 0].copy()
+                of_kind = kinds == row
+                if of_kind.any():
+                    # A slice makes a view instead of a copy if all solids are of one kind.
+                    chosen = slice(None) if of_kind.all() else of_kind
+                    labels = nodes[chosen] if kind == "hexahedron" else nodes[chosen][:, corners]
+                    numbers = rows[chosen, 0].copy()
                     resolved = self.numbering["node"].resolve(labels, numbers, origin)
                     mesh.cells.append(Cells(kind, f"SOLID, {len(corners)} nodes", numbers, resolved, origin))
-                    parts.append(part[some])
+                    parts.append(part[chosen])
         self.solids.clear()
         meshfile.check_unique_cells(mesh.cells)
         part_of = meshfile.joined(parts)
         for name, rows, origin in self.others:
-            nodes, found = self.numbering["node"].rows(rows[:, 2:])
-            own = mesh.n_cells + np.arange(len(rows))
-            mesh.cells.append(Cells("other", name, rows[:, 0], np.where(found, nodes, -1), origin))
+            nodes, exists = self.numbering["node"].rows(rows[:, 2:])
+            members = mesh.n_cells + np.arange(len(rows))
+            mesh.cells.append(Cells("other", name, rows[:, 0], np.where(exists, nodes, -1), origin))
             if np.isin(rows[:, 1], list(self.parts)).any():
-                mesh.structural.add(meshfile.add_set(mesh.cell_sets, name.lower(), own))
+                mesh.structural.add(meshfile.add_set(mesh.cell_sets, name.lower(), members))
         return part_of
 
     def _name_sets(self) -> None:
@@ -497,11 +460,10 @@ class _Reader:
         for kind, sets in (("node", mesh.node_sets), ("cell", mesh.cell_sets)):
             for number, chosen in self.sets[kind].items():
                 chosen.name = meshfile.add_set(sets, chosen.name, self._members(kind, number, ()))
-        self.part_sets: dict[int, str] = {}
         for number in np.unique(self.part_of).tolist():
             title, material = self.parts.get(number, ("", 0))
             cells = np.flatnonzero(self.part_of == number)
-            name = self.part_sets[number] = meshfile.add_set(mesh.cell_sets, title or f"part {number}", cells)
+            name = meshfile.add_set(mesh.cell_sets, title or f"part {number}", cells)
             if material in self.materials:
                 mesh.materials.append((name, self.materials[material]))
             elif material:
@@ -514,6 +476,7 @@ class _Reader:
                 meshfile.add_set(mesh.cell_sets, f"parts {number}", meshfile.union(members))
 
     def _members(self, kind: str, number: int, within: tuple[int, ...]) -> Ints:
+        """Rows, ascending, of a set; `within` are the sets that refer to it."""
         chosen, numbering = self.sets[kind][number], self.numbering[kind]
         if number in within:
             raise InputError(f"{chosen.origin}: set {number} is a part of itself; break the circle")
@@ -570,12 +533,27 @@ class _Reader:
         self.remarks.append(f"{card.origin}: curve {curve} is replaced by the loading curve, up to its last value")
 
 
+#: Methods by the pattern of the keyword's name; the first match counts.
+_HANDLERS: dict[str, Callable[[_Reader, _Keyword], None]] = {
+    "NODE": _Reader._node,
+    "ELEMENT_SOLID": _Reader._solid,
+    "ELEMENT_(SHELL|BEAM|TSHELL).*": _Reader._other,
+    "SET_(NODE|SOLID|PART).*": _Reader._set,
+    "PART(_.*)?": _Reader._part,
+    "MAT_.*": _Reader._material,
+    "BOUNDARY_SPC_(?!.*SYMMETRY).*": _Reader._prescribed,
+    "BOUNDARY_PRESCRIBED_MOTION_.*": _Reader._prescribed,
+    "DEFINE_CURVE(_TITLE)?": _Reader._curve,
+    "PARAMETER(_LOCAL)?": _Reader._parameters,
+}
+
+
 def _labels(values: list[int], card: _Card) -> Ints:
-    """Numbers of nodes, solids or parts; 0 is an empty field."""
-    chosen = [value for value in values if value]
-    if any(not 0 < value <= meshfile.MAX_ID for value in chosen):
+    """Numbers of nodes, solids or parts, without zeros, which are empty fields."""
+    labels = [value for value in values if value]
+    if any(not 0 < value <= meshfile.MAX_ID for value in labels):
         raise InputError(f"{card.origin}: a number is not between 1 and {meshfile.MAX_ID}; correct it")
-    return np.array(chosen, np.int64)
+    return np.array(labels, np.int64)
 
 
 #: Rows of the corners among the eight nodes; the other nodes repeat one of them.
@@ -588,7 +566,7 @@ _CORNERS = {
 
 
 def _kinds(nodes: Ints) -> NDArray[np.int8]:
-    """Kind (n,), a row of _CORNERS, of solids with eight nodes (n, 8), of which the last may be equal or 0."""
+    """Kind (n,), a row of _CORNERS, of solids with eight nodes (n, 8); the last nodes may be equal or 0."""
     last = nodes[:, 4:]
     kinds = np.zeros(len(nodes), np.int8)
     kinds[(last == last[:, :1]).all(axis=1)] = 2

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 #: kg/m^3 of a material without a density.
 DENSITY = 1000.0
-#: A larger relative difference of the integration volumes from the void's volume is warned about.
+#: Largest relative difference of the integration volumes from the void's volume without a warning.
 VOLUME_TOLERANCE = 0.01
 _PASCALS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9}
 _DENSITIES = {"kg/m3": 1.0, "g/cm3": 1e3, "kg/mm3": 1e9, "t/mm3": 1e12}
@@ -47,7 +47,7 @@ def read_file(path: Path) -> MeshFile:
 
 
 def files(section: deck.MeshFiles) -> list[Path]:
-    """The mesh files of a deck and all their includes: the model depends on their contents."""
+    """The mesh files of a deck and all their includes."""
     return [included for path in (section.fe, section.efg) if path for included in _reader(path)[1](path)]
 
 
@@ -75,14 +75,14 @@ def _reader(path: Path) -> tuple[Callable[[Path], MeshFile], Callable[[Path], li
 
 @dataclass(slots=True)
 class _Source:
-    """A file in metres, and the nodes and cells of the mesh that come from it."""
+    """A file in metres, and the maps of its nodes and elements to nodes and cells of the mesh."""
 
     file: MeshFile
-    points: Floats  # (n, 3), m, all of the file
+    points: Floats  # (n, 3), m, all nodes of the file
     metre: float  # m per unit of length
     node_map: Ints  # (n,), node of the mesh; -1 if it is left out
-    parents: Ints = field(default_factory=lambda: np.empty(0, np.int64))  # (k,), the file's element of each cell
-    cells: Ints = field(default_factory=lambda: np.empty(0, np.int64))  # (k,), that cell of the mesh
+    parents: Ints = field(default_factory=lambda: np.empty(0, np.int64))  # (k,), element of the file
+    cells: Ints = field(default_factory=lambda: np.empty(0, np.int64))  # (k,), cell of the mesh from this element
 
     def add_cells(self, parents: Ints, cells: Ints) -> None:
         self.parents, self.cells = np.concatenate([self.parents, parents]), np.concatenate([self.cells, cells])
@@ -94,18 +94,18 @@ class _Source:
 
 @dataclass(slots=True)
 class _Integration:
-    """Integration points, and the elements of one file or the named sets that they belong to."""
+    """Integration points with their elements in one file, or with named sets."""
 
     points: Floats = field(default_factory=lambda: np.empty((0, 3)))  # m
     volumes: Floats = field(default_factory=lambda: np.empty(0))  # m^3
     sets: dict[str, Ints] = field(default_factory=dict)
     parent_file: MeshFile | None = None
-    parents: Ints = field(default_factory=lambda: np.empty(0, np.int64))  # element of each point
+    parents: Ints = field(default_factory=lambda: np.empty(0, np.int64))  # (n,), element of the point
     void: Floats = field(default_factory=lambda: np.empty((0, 8, 3)))  # corners of the void's cells, if known
 
 
 def read_mesh(section: deck.MeshFiles, seed_volume: float = 0.0) -> Mesh:
-    """The mesh of a deck's files: FE nodes in the FE file's order, then those of the EFG file that are no FE nodes.
+    """The mesh of a deck's files: FE nodes in the FE file's order, then EFG nodes in the EFG file's order.
 
     `seed_volume` (m^3) is the part of the void without integration points. InputError if a file is wrong.
     """
@@ -117,7 +117,7 @@ def read_mesh(section: deck.MeshFiles, seed_volume: float = 0.0) -> Mesh:
 
 
 def assemble(section: deck.MeshFiles, fe: MeshFile | None, efg: MeshFile | None, seed_volume: float = 0.0) -> Mesh:
-    """The mesh of the contents of an FE file and an EFG file; see `read_mesh`."""
+    """The mesh of an FE file and an EFG file that have been read; see `read_mesh`."""
     remarks: list[str] = []
     for file in (fe, efg):
         if file:
@@ -174,7 +174,7 @@ def assemble(section: deck.MeshFiles, fe: MeshFile | None, efg: MeshFile | None,
 
 
 def _fe_source(section: deck.MeshFiles, fe: MeshFile, remarks: list[str]) -> tuple[_Source, Ints, Bools]:
-    """The FE file in metres, its hexahedra (n, 8) in nodes of the mesh, and its elements that are not dropped."""
+    """The FE file in metres, its hexahedra (n, 8) in nodes of the mesh, and a mask of elements that are not dropped."""
     kept = np.ones(fe.n_cells, bool)
     for name in section.dropped:
         if name not in fe.cell_sets:
@@ -185,8 +185,8 @@ def _fe_source(section: deck.MeshFiles, fe: MeshFile, remarks: list[str]) -> tup
         kept[fe.cell_sets[name]] = False
     metre = METRES[section.unit]
     points = fe.points * metre if metre != 1 else fe.points
-    hexahedra, parents, found = solids.read_hexahedra(fe, points, kept, section.repair)
-    remarks += found
+    hexahedra, parents, more_remarks = solids.read_hexahedra(fe, points, kept, section.repair)
+    remarks += more_remarks
     if section.fe and not len(hexahedra) and not section.dropped:
         types = meshfile.listed({block.type: 0 for block in fe.cells})
         raise InputError(f"{fe.path}: has no hexahedra (elements: {types}); it may be mesh.efg, not mesh.fe")
@@ -200,7 +200,7 @@ def _fe_source(section: deck.MeshFiles, fe: MeshFile, remarks: list[str]) -> tup
 
 
 def _efg_source(efg: MeshFile, metre: float, fe_points: Floats, tolerance: float) -> tuple[_Source, Ints]:
-    """The EFG file in metres, merged into the FE nodes, and the FE nodes, ascending, that it repeats.
+    """The EFG file in metres with nodes merged into FE nodes, and the FE nodes, ascending, at these points.
 
     If the file has solids, only their nodes are used.
     """
@@ -221,8 +221,8 @@ def _efg_source(efg: MeshFile, metre: float, fe_points: Floats, tolerance: float
 def _integration(section: deck.MeshFiles, fe: _Source, kept: Bools, efg: _Source) -> _Integration:
     """Integration points from a table, from the dropped elements of the FE file, or from the EFG file's elements."""
     dropped, dropped_rows = solids.solid_corners(fe.file, fe.points, ~kept)
-    own, own_rows = solids.solid_corners(efg.file, efg.points)
-    void = dropped if len(dropped) else own
+    solid, solid_rows = solids.solid_corners(efg.file, efg.points)
+    void = dropped if len(dropped) else solid
     if section.integration_points:
         points, volumes, sets = tables.read_grid(section.integration_points)
         metre = METRES[section.integration_unit or section.unit]
@@ -230,8 +230,8 @@ def _integration(section: deck.MeshFiles, fe: _Source, kept: Bools, efg: _Source
     if len(dropped):
         cells = subdivide(dropped, np.full((len(dropped), 3), section.cuts))
         file, parents = fe.file, np.repeat(dropped_rows, section.cuts**3)
-    elif len(own):
-        cells, file, parents = own, efg.file, own_rows
+    elif len(solid):
+        cells, file, parents = solid, efg.file, solid_rows
     else:
         raise InputError(
             f"{efg.file.path}: has no elements to integrate over; give mesh.integration_points, or mesh.dropped"
@@ -273,7 +273,7 @@ def _integration_warnings(
     node_sets: dict[str, Ints],
     seed_volume: float,
 ) -> Iterator[str]:
-    """Warnings about integration points outside the void, and volumes that do not sum to the void's."""
+    """Warnings about integration points outside the void, and about their total volume."""
     source = section.integration_points or section.efg
     in_hexahedra = checks.inside(integration.points, points[hexahedra])
     if n := np.count_nonzero(in_hexahedra):
@@ -283,11 +283,11 @@ def _integration_warnings(
     if len(integration.void):
         expected: float | None = float(np.abs(volumes_and_centroids(integration.void)[0]).sum())
         outside = np.count_nonzero(~checks.inside(integration.points, integration.void) & ~in_hexahedra)
-        # A point on a plane between cells counts as outside both; a regular grid may have all its points there.
+        # A point on a plane between cells counts as outside both. All points of a regular grid may lie on such planes.
         if outside > 0.5 * len(integration.points):
             yield f"warning: {source}: {outside} integration points lie outside the cells of the void"
         if not section.dropped:
-            seed_volume = 0.0  # the cells leave the seed out
+            seed_volume = 0.0  # the cells do not include the seed
     else:
         on_interface = np.zeros(len(points), bool)
         on_interface[node_sets.get("interface", [])] = True
@@ -308,15 +308,15 @@ def _block(hexahedra: Ints) -> Cells:
 
 
 def _outer_surface(points: Floats, hexahedra: Ints, efg: _Source, interface: Ints) -> Ints:
-    """Nodes of the exterior faces of hexahedra and of the EFG file's solids that do not lie on the interface."""
+    """Nodes of exterior faces of hexahedra and of the EFG file's solids, except faces on the interface."""
     on_interface = np.zeros(len(points) + 1, bool)
     on_interface[interface] = True
     on_interface[-1] = True  # -1 pads triangles
-    own = [
+    efg_solids = [
         Cells(block.kind, block.type, block.ids, efg.node_map[block.nodes], block.origin)
         for block, _ in efg.file.blocks(*meshfile.SOLIDS)
     ]
-    faces = np.concatenate([meshfile.exterior_faces(cells)[0] for cells in ([_block(hexahedra)], own)])
+    faces = np.concatenate([meshfile.exterior_faces(cells)[0] for cells in ([_block(hexahedra)], efg_solids)])
     nodes = np.unique(faces[~on_interface[faces].all(axis=1)])
     return nodes[nodes >= 0]
 
@@ -354,7 +354,7 @@ def _materials(
                 )
             material = Material(given.name, law, density)
             if name not in cell_sets:
-                continue  # all of its elements are left out
+                continue  # all elements of the set are left out
             if found.setdefault(name, material) != material:
                 raise InputError(
                     f"{given.origin}: the cells of '{name}' have material {found[name].name} already; rename one set"
@@ -363,7 +363,7 @@ def _materials(
 
 
 def _constraints(sources: list[_Source], node_sets: dict[str, Ints], remarks: list[str]) -> Iterator[Constraint]:
-    """Constraints of all files, in metres, on sets of the mesh; a constraint holds for the nodes of its file only."""
+    """Constraints of all files, in metres, on sets of the mesh; each is restricted to the nodes of its file."""
     for source in sources:
         for given in source.file.constraints:
             nodes = source.node_map[source.file.node_sets[given.node_set]]
@@ -379,7 +379,7 @@ def _constraints(sources: list[_Source], node_sets: dict[str, Ints], remarks: li
                 if not _same_in_all(sources, given):
                     name = meshfile.add_set(node_sets, f"{source.file.path.name}:{name}", unique)
                 elif source is not sources[0]:
-                    continue  # the constraint of the first file holds for both
+                    continue  # the constraint of the first file is enough
             moves = [
                 value[used][first] * source.metre if isinstance(value, np.ndarray) else value * source.metre
                 for value in given.displacement
@@ -388,7 +388,7 @@ def _constraints(sources: list[_Source], node_sets: dict[str, Ints], remarks: li
 
 
 def _same_in_all(sources: Iterable[_Source], given: Constraint) -> bool:
-    """Whether every file with the set has the same constraint on it, so that one constraint holds for all."""
+    """Whether every file with the set has the same uniform constraint on it."""
 
     def is_uniform(constraint: Constraint) -> bool:
         return not any(isinstance(value, np.ndarray) for value in constraint.displacement)

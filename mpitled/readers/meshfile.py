@@ -12,11 +12,11 @@ from mpitled.errors import InputError
 from mpitled.mesh import Bools, Constraint, Floats, Ints
 from mpitled.meshing.faces import unshared
 
-#: Larger numbers of nodes and elements are errors: programs that write decks store numbers in 32 bits.
+#: Largest number of a node or element: programs that write decks store these numbers in 32 bits.
 MAX_ID = 2**31 - 1
-#: Limit of coordinates in the file's unit: volumes and their products must stay finite.
+#: Limit of coordinates in the file's unit, so that volumes and their products are finite.
 MAX_COORDINATE = 1e12
-#: Number of corners of the solids that are read; all other elements have the kind "other".
+#: Number of corners of the supported solids; all other elements have the kind "other".
 SOLIDS = {"hexahedron": 8, "wedge": 6, "pyramid": 5, "tetrahedron": 4}
 #: Corners of the faces S1, S2, ... of Abaqus's solids, clockwise seen from outside; -1 pads triangles.
 FACES = {
@@ -53,8 +53,8 @@ class FileMaterial:
 class MeshFile:
     """Nodes, elements, sets, constraints and materials of one file and its includes.
 
-    Cell sets number the elements through all of `cells`. `refused` names the parts of the file that change the
-    mechanics and cannot be computed, one line each.
+    Cell sets number the elements of all `cells` consecutively. `refused` has one line for each unsupported part of the
+    file that changes the mechanics.
     """
 
     path: Path
@@ -76,7 +76,7 @@ class MeshFile:
         return sum(len(block.ids) for block in self.cells)
 
     def blocks(self, *kinds: str) -> Iterator[tuple[Cells, Ints]]:
-        """Non-empty blocks of these kinds (default: of all kinds), and the numbers of their elements."""
+        """Non-empty blocks of these kinds (default: all kinds), and the rows of their elements."""
         first = 0
         for block in self.cells:
             if (not kinds or block.kind in kinds) and len(block.ids):
@@ -84,24 +84,25 @@ class MeshFile:
             first += len(block.ids)
 
     def element(self, row: int) -> tuple[Cells, int]:
-        """The block of an element and the file's number of the element."""
+        """The block of an element, and its number in the file."""
         block, rows = next((block, rows) for block, rows in self.blocks() if rows[0] <= row <= rows[-1])
         return block, int(block.ids[row - rows[0]])
 
     def nodes_of(self, rows: Ints, face: int | None = None) -> Ints:
-        """Nodes, ascending, of elements (ascending), or of one face of each: 0 is S1."""
-        found = []
-        for block, own in self.blocks():
-            nodes = block.nodes[rows[(rows >= own[0]) & (rows <= own[-1])] - own[0]]
+        """Nodes, ascending, of elements (ascending), or of one face of each element: 0 is S1."""
+        parts = []
+        for block, block_rows in self.blocks():
+            first, last = block_rows[0], block_rows[-1]
+            nodes = block.nodes[rows[(rows >= first) & (rows <= last)] - first]
             if face is not None and block.kind in FACES:
                 faces = FACES[block.kind]
                 nodes = nodes[:, [corner for corner in faces[min(face, len(faces) - 1)] if corner >= 0]]
-            found.append(np.unique(nodes))
-        nodes = union(found)
+            parts.append(np.unique(nodes))
+        nodes = union(parts)
         return nodes[nodes >= 0]
 
     def set_of(self, nodes: Ints, name: str) -> str:
-        """The name of a node set with exactly these nodes (ascending): an existing set, or a new one called `name`."""
+        """The name of the node set with exactly these nodes (ascending); if it is missing, it is added as `name`."""
         for existing, members in self.node_sets.items():
             if len(members) == len(nodes) and (members == nodes).all():
                 return existing
@@ -109,7 +110,7 @@ class MeshFile:
 
 
 class Numbering:
-    """Map from a file's numbers to rows of its arrays; gaps in the numbers take no memory."""
+    """Map from a file's numbers to rows of its arrays, without memory for gaps in the numbers."""
 
     def __init__(self, ids: Ints) -> None:
         ascending = bool((np.diff(ids) > 0).all())
@@ -118,7 +119,7 @@ class Numbering:
         self._dense = len(ids) > 0 and int(self.ids[-1]) - int(self.ids[0]) == len(ids) - 1
 
     def rows(self, labels: Ints) -> tuple[Ints, Bools]:
-        """Rows of the numbers `labels`, and which of the numbers exist; the row of a missing number is arbitrary."""
+        """Rows of the numbers `labels`, and a mask of existing numbers; the row of a missing number is arbitrary."""
         if len(self.ids) == 0:
             return np.zeros(labels.shape, np.int64), np.zeros(labels.shape, bool)
         place = labels - self.ids[0] if self._dense else np.searchsorted(self.ids, labels)
@@ -127,13 +128,13 @@ class Numbering:
         return (place if self.order is None else self.order[place]), found
 
     def between(self, first: int, last: int, step: int) -> Ints:
-        """Rows of those of the numbers first, first + step, ... up to last that exist."""
+        """Rows of the existing numbers among first, first + step, ..., last."""
         start, stop = np.searchsorted(self.ids, [first, last + 1])
         place = start + np.flatnonzero((self.ids[start:stop] - first) % step == 0)
         return place if self.order is None else self.order[place]
 
     def members(self, labels: Ints, kind: str, name: str, origin: str, remarks: list[str]) -> Ints:
-        """Rows of a set's members; missing members are left out with a warning in `remarks`."""
+        """Rows of a set's members; missing members are ignored with a warning in `remarks`."""
         rows, found = self.rows(labels)
         if not found.all():
             missing = labels[~found]
@@ -147,9 +148,9 @@ class Numbering:
         """Rows (n, k) of the nodes of elements (n,); InputError if the file does not define one of the nodes."""
         rows, missing = np.empty(labels.shape, np.int64), np.zeros(len(labels), bool)
         for first in range(0, len(labels), 1 << 16):
-            some = slice(first, first + (1 << 16))
-            rows[some], found = self.rows(labels[some])
-            missing[some] = ~found.all(axis=1)
+            chunk = slice(first, first + (1 << 16))
+            rows[chunk], exists = self.rows(labels[chunk])
+            missing[chunk] = ~exists.all(axis=1)
         if missing.any():
             element = int(np.argmax(missing))
             unknown = labels[element][~self.rows(labels[element])[1]]
@@ -162,7 +163,7 @@ class Numbering:
 
 @dataclass(slots=True)
 class NodeTable:
-    """Nodes in the blocks in which a file defines them."""
+    """Nodes in blocks, as a file defines them."""
 
     ids: list[Ints] = field(default_factory=list)
     points: list[Floats] = field(default_factory=list)
@@ -183,7 +184,7 @@ class NodeTable:
         twice = numbering.order[1:][np.diff(numbering.ids) == 0]
         if not len(twice):
             return ids, points
-        first = numbering.rows(ids[twice])[0]  # the first of equal numbers, because the order is stable
+        first = numbering.rows(ids[twice])[0]  # the first of equal numbers, because the sort is stable
         apart = np.flatnonzero((points[first] != points[twice]).any(axis=1))
         if len(apart):
             row = int(twice[apart[0]])
@@ -196,17 +197,17 @@ class NodeTable:
 
 
 def joined(arrays: Iterable[Ints]) -> Ints:
-    """The arrays one after the other; empty without any."""
+    """The concatenated arrays; empty without arrays."""
     return np.concatenate([np.empty(0, np.int64), *arrays])
 
 
 def union(arrays: Iterable[Ints]) -> Ints:
-    """All members of the arrays, ascending, each once."""
+    """The distinct members of the arrays, ascending."""
     return np.unique(joined(arrays))
 
 
 def add_set(sets: dict[str, Ints], name: str, members: Ints) -> str:
-    """Enter a new set; if the name exists already, a number is appended. Returns the name."""
+    """Add a set under the name, or with a number appended if the name exists. Returns the name."""
     free, n = name, 2
     while free in sets:
         free, n = f"{name}_{n}", n + 1
@@ -215,12 +216,12 @@ def add_set(sets: dict[str, Ints], name: str, members: Ints) -> str:
 
 
 def extend_set(sets: dict[str, Ints], name: str, members: Ints) -> None:
-    """Enter members (ascending) into the set with that name, or into a new one."""
+    """Add members (ascending) to the set of that name, which may be new."""
     sets[name] = np.union1d(sets[name], members) if name in sets else members
 
 
 def listed(items: Iterable[object], most: int = 8) -> str:
-    """The first items, with commas between them; "none" without any."""
+    """The first items, separated by commas; "none" without items."""
     texts = [str(item) for item in items]
     return ", ".join(texts[:most]) + (f" and {len(texts) - most} more" if len(texts) > most else "") or "none"
 
@@ -255,7 +256,7 @@ def check_unique_cells(cells: list[Cells]) -> None:
 
 
 def invalid_moduli(youngs_modulus: float, poissons_ratio: float) -> str:
-    """Why the moduli are those of no elastic solid; "" if they are valid."""
+    """The reason why the moduli are invalid for an elastic solid; "" if they are valid."""
     valid = youngs_modulus > 0 and -1 < poissons_ratio < 0.5
     return "" if valid else f"has E = {youngs_modulus:g} and nu = {poissons_ratio:g}"
 
@@ -268,7 +269,7 @@ def unused_material(origin: str, material: str, reason: str, cell_set: str) -> s
 
 
 def exterior_faces(cells: Iterable[Cells]) -> tuple[Ints, Ints]:
-    """Nodes (m, 4) of the faces with one solid only (-1 pads triangles), and the rows of these solids."""
+    """Nodes (m, 4) of faces that belong to one solid only (-1 pads triangles), and the rows of these solids."""
     faces, owners, first = [np.empty((0, 4), np.int64)], [np.empty(0, np.int64)], 0
     for block in cells:
         for corners in FACES.get(block.kind, ()):

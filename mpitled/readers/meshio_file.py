@@ -1,4 +1,4 @@
-"""Mesh files in the formats of meshio. The only importer of meshio."""
+"""Mesh files in the formats of meshio."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import store
 from mpitled.errors import InputError
+from mpitled.hdf5 import check_hdf5
 from mpitled.mesh import Ints
 from mpitled.readers import meshfile
 from mpitled.readers.meshfile import Cells, MeshFile
@@ -31,8 +31,8 @@ def read(path: Path) -> MeshFile:
     import meshio
 
     if path.suffix.lower() not in meshio.extension_to_filetypes:
-        some = ".vtu, .vtk, .msh, .med, .xdmf, .mesh, .bdf, .e"
-        raise InputError(f"{path}: is no mesh in a known format; give an Abaqus or LS-DYNA deck, or {some} ...")
+        formats = ".vtu, .vtk, .msh, .med, .xdmf, .mesh, .bdf, .e"
+        raise InputError(f"{path}: is no mesh in a known format; give an Abaqus or LS-DYNA deck, or {formats} ...")
     _check_hdf5(path)
     try:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()) as printed:
@@ -45,18 +45,18 @@ def read(path: Path) -> MeshFile:
 
 
 def _check_hdf5(path: Path) -> None:
-    """InputError if an HDF5 file, or one that an XDMF file names, would lead meshio to other files."""
+    """InputError if the HDF5 file, or a file that an XDMF file names, would make meshio read further files."""
     with path.open("rb") as file:
         head = file.read(8)
     if head == b"\x89HDF\r\n\x1a\n":
-        store.check_hdf5(path)
+        check_hdf5(path)
     elif path.suffix.lower() in (".xdmf", ".xmf"):
         text = decode(read_text(path, "a mesh (XDMF)"))
         for name in sorted(set(re.findall(r"([^<>\s]+):/", text))):
             beside = path.parent / name
             if Path(name).name != name or not beside.is_file():
                 raise InputError(f"{path}: its data are in {name}, which is not beside it; put it there")
-            store.check_hdf5(beside)
+            check_hdf5(beside)
 
 
 def _converted(mesh: Any, path: Path) -> MeshFile:
@@ -88,13 +88,13 @@ def _enter_sets(mesh: Any, file: MeshFile) -> None:
     starts = np.cumsum([0, *(len(block.ids) for block in file.cells)])
     for name, blocks in mesh.cell_sets.items():
         if not name.startswith("gmsh:"):
-            own = [
+            members = [
                 start + _members(rows, len(block.ids), name, file)
                 for start, rows, block in zip(starts, blocks, file.cells, strict=False)
                 if rows is not None
             ]
-            meshfile.add_set(file.cell_sets, name, meshfile.union(own))
-    # A group of gmsh is a tag and a dimension; other formats keep other data there.
+            meshfile.add_set(file.cell_sets, name, meshfile.union(members))
+    # In gmsh files, field_data has the tag and dimension of each group; other formats have other data.
     fields = getattr(mesh, "field_data", {}).items()
     groups = {int(np.ravel(pair)[0]): name for name, pair in fields if _is_group(pair)}
     cell_data = {name: meshfile.joined(map(np.ravel, parts)) for name, parts in mesh.cell_data.items()}
@@ -106,17 +106,17 @@ def _enter_sets(mesh: Any, file: MeshFile) -> None:
             column: NDArray[Any] = np.asarray(values)
             if name in ("gmsh:geometrical", "gmsh:dim_tags") or column.dtype.kind not in "iu":
                 continue
-            if column.shape != (size,) or len(different := np.unique(column)) > _MAX_VALUES:
+            if column.shape != (size,) or len(distinct := np.unique(column)) > _MAX_VALUES:
                 continue
-            for value in different:
+            for value in distinct:
                 if name == "gmsh:physical":
                     names = [groups.get(int(value), f"physical {value}")]
                 elif name in ("cell_tags", "point_tags"):
                     names = list(families.get(int(value), []))
                 else:
                     names = [f"{name} {value}"]
-                for chosen in names:
-                    meshfile.extend_set(sets, chosen, np.flatnonzero(column == value))
+                for set_name in names:
+                    meshfile.extend_set(sets, set_name, np.flatnonzero(column == value))
 
 
 def _members(rows: Any, end: int, name: str, file: MeshFile) -> Ints:

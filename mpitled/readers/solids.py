@@ -12,7 +12,7 @@ from mpitled.meshing.integration_cells import volumes_and_centroids
 from mpitled.readers import abaqus, meshfile
 from mpitled.readers.meshfile import MeshFile
 
-#: Each solid as a hexahedron with coinciding corners: its volume and centroid are still exact.
+#: Each solid as a hexahedron with coinciding corners, with exact volume and centroid.
 AS_HEXAHEDRON = {
     "hexahedron": [0, 1, 2, 3, 4, 5, 6, 7],
     "wedge": [0, 1, 2, 2, 3, 4, 5, 5],
@@ -22,7 +22,7 @@ AS_HEXAHEDRON = {
 
 
 def check_solids(file: MeshFile) -> None:
-    """InputError if the file has no nodes, elements but no solids, solids given twice, or parts that are refused."""
+    """InputError if the file has no nodes, elements but no solids, repeated solids, or unsupported parts."""
     if len(file.points) == 0:
         raise InputError(f"{file.path}: has no nodes; give a mesh")
     if file.cells and not any(block.kind != "other" or abaqus.is_solid(block.type) for block in file.cells):
@@ -40,7 +40,7 @@ def check_solids(file: MeshFile) -> None:
         rows = np.concatenate([rows for _, rows in blocks])
         again, before = checks.repeated(nodes)
         if len(again):
-            (block, number), (_, first) = (file.element(int(rows[found[0]])) for found in (again, before))
+            (block, number), (_, first) = (file.element(int(rows[repeat[0]])) for repeat in (again, before))
             raise InputError(
                 f"{block.origin}: element {number} has the same nodes as element {first}, and would count twice "
                 f"({len(again)} such); take one of the two out"
@@ -48,7 +48,7 @@ def check_solids(file: MeshFile) -> None:
 
 
 def check_cloud(file: MeshFile) -> list[str]:
-    """Remarks about a file that can only be the cloud's; InputError if one of its cells is flat."""
+    """Remarks about a file that can only be an EFG file; InputError if a cell is flat."""
     remarks = leave_out_others(file)
     corners, parents = solid_corners(file, file.points)
     if len(corners):
@@ -59,9 +59,10 @@ def check_cloud(file: MeshFile) -> list[str]:
 
 
 def leave_out_others(file: MeshFile) -> list[str]:
-    """Remarks about shells, beams and the like, which are left out; their sets become node sets of the solids' faces.
+    """Remarks about shells, beams and similar elements, which are left out.
 
-    InputError for elements with a section that share nodes with a solid.
+    A cell set of such elements becomes a node set of the solids. InputError if elements with a section share nodes with
+    a solid.
     """
     solid, remarks = has_solid(file), []
     structural, is_other = np.zeros(file.n_cells, bool), np.zeros(file.n_cells, bool)
@@ -87,7 +88,7 @@ def leave_out_others(file: MeshFile) -> list[str]:
 
 
 def has_solid(file: MeshFile) -> Bools:
-    """Which nodes (n_nodes,) of the file belong to a solid."""
+    """Mask (n_nodes,) of nodes that belong to a solid."""
     used = np.zeros(len(file.points), bool)
     for block, _ in file.blocks(*meshfile.SOLIDS):
         used[block.nodes] = True
@@ -95,10 +96,10 @@ def has_solid(file: MeshFile) -> Bools:
 
 
 def read_hexahedra(file: MeshFile, points: Floats, chosen: Bools, repair: bool) -> tuple[Ints, Ints, list[str]]:
-    """Hexahedra (n, 8) in rows of `points`, their elements (n,) in the file, and remarks.
+    """Hexahedra (n, 8) in rows of `points`, the rows (n,) of their elements in the file, and remarks.
 
-    InputError for other solids among the `chosen` elements (n_cells,), and for inverted or flat hexahedra. With
-    `repair`, hexahedra that another order of their nodes makes valid are reordered.
+    InputError if there are other solids among the `chosen` elements (mask, n_cells), or inverted or flat hexahedra.
+    With `repair`, the nodes of hexahedra are reordered if this makes the hexahedra valid.
     """
     for block, rows in file.blocks("tetrahedron", "wedge", "pyramid"):
         if n := np.count_nonzero(chosen[rows]):
@@ -114,12 +115,12 @@ def read_hexahedra(file: MeshFile, points: Floats, chosen: Bools, repair: bool) 
     remarks = []
     invalid, poor = hexahedra.check(points, cells)
     if len(invalid):
-        better = checks.reordered(points, cells, invalid)
-        repairable = better[:, 0] >= 0
+        reordered = checks.reordered(points, cells, invalid)
+        repairable = reordered[:, 0] >= 0
         hint = "correct the mesh"
         if repair:
             cells = cells.copy()
-            cells[invalid[repairable]] = better[repairable]
+            cells[invalid[repairable]] = reordered[repairable]
             if repairable.any():
                 remarks.append(f"{file.path}: nodes of {np.count_nonzero(repairable)} hexahedra put in order")
             invalid = invalid[~repairable]
@@ -140,12 +141,12 @@ def read_hexahedra(file: MeshFile, points: Floats, chosen: Bools, repair: bool) 
 
 
 def solid_corners(file: MeshFile, points: Floats, chosen: Bools | None = None) -> tuple[Floats, Ints]:
-    """Corners (n, 8, 3) of the file's solids as hexahedra, and their elements (n,)."""
+    """Corners (n, 8, 3) of the chosen solids (mask, n_cells) as hexahedra, and the rows (n,) of their elements."""
     corners, parents = [np.empty((0, 8, 3))], [np.empty(0, np.int64)]
     for block, rows in file.blocks(*meshfile.SOLIDS):
-        some = chosen[rows] if chosen is not None else np.ones(len(rows), bool)
-        corners.append(points[block.nodes[some][:, AS_HEXAHEDRON[block.kind]]])
-        parents.append(rows[some])
+        mask = chosen[rows] if chosen is not None else np.ones(len(rows), bool)
+        corners.append(points[block.nodes[mask][:, AS_HEXAHEDRON[block.kind]]])
+        parents.append(rows[mask])
     return np.concatenate(corners), np.concatenate(parents)
 
 

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mpitled import store
-from mpitled.errors import InputError
+from mpitled import hdf5_validation, resources
+from mpitled.errors import InputError, damaged
+from mpitled.hdf5 import open_file
 from mpitled.mesh import Floats, Ints
 from mpitled.readers import meshfile
 from mpitled.readers.text import Block, decode, read_text, separated, where
@@ -16,11 +17,11 @@ from mpitled.readers.text import Block, decode, read_text, separated, where
 def read_grid(path: Path) -> tuple[Floats, Floats, dict[str, Ints]]:
     """Points (n, 3), volumes (n,) and sets of integration points, in the file's units, from CSV or HDF5.
 
-    CSV has a line for each point: x, y, z, volume and, optionally, the names of the point's sets with semicolons
-    between them. The first line may give the names of the columns. InputError if a volume is not positive.
+    CSV has a line for each point: x, y, z, volume and, optionally, the names of the point's sets, separated by
+    semicolons. The first line may be the names of the columns. InputError if a volume is not positive.
     """
     if path.suffix.lower() in (".h5", ".hdf5", ".hdf"):
-        points, volumes = store.read_grid(path)
+        points, volumes = _read_hdf5(path)
         sets: dict[str, Ints] = {}
         first = None
     else:
@@ -43,7 +44,7 @@ def read_grid(path: Path) -> tuple[Floats, Floats, dict[str, Ints]]:
 
 
 def read_areas(path: Path, metre: float, ids: Ints) -> Floats:
-    """Areas (n_nodes, 3), m^2, of a table of node, x, y, z; 0 for nodes without a line."""
+    """Areas (n_nodes, 3), m^2, from a table of node, x, y, z; 0 for nodes without a line."""
     rows, first = _read_table(path, ("node", "x", "y", "z"))
     numbering = meshfile.Numbering(ids)
     if (np.diff(numbering.ids) == 0).any():
@@ -58,7 +59,7 @@ def read_areas(path: Path, metre: float, ids: Ints) -> Floats:
 
 
 def read_field(path: Path) -> tuple[Floats, int]:
-    """Points and displacements (n, 6), x, y, z, ux, uy, uz in the file's unit, and the line of the first row."""
+    """Rows (n, 6) of x, y, z, ux, uy, uz in the file's unit, and the line of the first row."""
     rows, first = _read_table(path, ("x", "y", "z", "ux", "uy", "uz"))
     bad = np.flatnonzero(~(np.abs(rows) < meshfile.MAX_COORDINATE).all(axis=1))
     if len(bad):
@@ -69,7 +70,7 @@ def read_field(path: Path) -> tuple[Floats, int]:
 
 
 def _read_table(path: Path, names: tuple[str, ...]) -> tuple[Floats, int]:
-    """Numbers (n, len(names)) of a CSV file, and the line of the first row; the first line may give the names."""
+    """Numbers (n, len(names)) of a CSV file, and the line of the first row; the first line may be the names."""
     text = read_text(path, f"a table of {', '.join(names)} (CSV)")
     end = text.find(b"\n") + 1 or len(text)
     header = [name.strip().casefold() for name in decode(text[:end]).split(",")]
@@ -89,6 +90,25 @@ def _rows_of(block: Block, width: int, names: str) -> Floats:
     return values.reshape(-1, width)
 
 
+def _read_hdf5(path: Path) -> tuple[Floats, Floats]:
+    """Positions (n, 3) and volumes (n,) from the datasets x, y, z and volume of the root group."""
+    names = ("x", "y", "z", "volume")
+    with open_file(path) as file, damaged(path, "write it anew"):
+        if missing := [name for name in names if name not in file]:
+            raise InputError(f"{path}: has no dataset '{missing[0]}'; give x, y, z and volume")
+        datasets = [hdf5_validation.member(file, name, path) for name in names]
+        shapes = {getattr(item, "shape", None) for item in datasets}
+        kinds = {item.dtype.kind for item in datasets if hasattr(item, "dtype")}
+        if len(shapes) > 1 or len(shapes.pop() or ()) != 1 or not kinds <= set("fiu"):
+            raise InputError(f"{path}: x, y, z and volume are not four lists of as many numbers; correct them")
+        for item in datasets:
+            hdf5_validation.check_dataset(item, path)
+        # Compressed data may be a thousand times as large as the file.
+        resources.check_memory(32 * len(datasets[0]), f"{path}: its {len(datasets[0])} points", "give fewer")
+        columns = [item[...].astype(np.float64) for item in datasets]
+    return np.stack(columns[:3], axis=1), columns[3]
+
+
 def _read_csv(path: Path) -> tuple[Floats, Floats, dict[str, Ints], int]:
     text = read_text(path, "a table of integration points (CSV)")
     end = text.find(b"\n") + 1 or len(text)
@@ -104,9 +124,9 @@ def _read_csv(path: Path) -> tuple[Floats, Floats, dict[str, Ints], int]:
     sets: dict[str, Ints] = {}
     if names:
         groups, group = np.unique(np.array(names), return_inverse=True)
-        for i, several in enumerate(groups.tolist()):
+        for i, set_names in enumerate(groups.tolist()):
             members = np.flatnonzero(group == i)
-            for name in filter(None, (part.strip() for part in several.split(";"))):
+            for name in filter(None, (part.strip() for part in set_names.split(";"))):
                 meshfile.extend_set(sets, name, members)
     return rows[:, :3].copy(), rows[:, 3].copy(), sets, 1 + named
 

@@ -19,9 +19,9 @@ from mpitled.mesh import Ints
 MAX_INCLUDES = 1000
 _CHUNK = 1 << 22  # bytes of text at once; bounds the temporary memory
 _SHOWN = 40  # characters of a wrong field that a message shows
-_PLAIN = bytes.maketrans(b"\r\tDd", b"  EE")  # blanks, and the exponents of Fortran
+_PLAIN = bytes.maketrans(b"\r\tDd", b"  EE")  # blanks and Fortran exponents
 _INTEGER = re.compile(r"[+-]?\d{1,20}", re.ASCII)
-#: Also 1.0D-3, 1.0-3 and .5, which Fortran reads.
+#: Includes the Fortran forms 1.0D-3, 1.0-3 and .5.
 _REAL = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+))(?:[eEdD]([+-]?\d{1,9})|([+-]\d{1,9}))?", re.ASCII)
 
 Number = TypeVar("Number", int, float)
@@ -29,7 +29,7 @@ Number = TypeVar("Number", int, float)
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Lines of data in a file: text[start:stop], with the first line's number `line`."""
+    """Lines of data in a file: text[start:stop]; `line` is the number of the first line."""
 
     path: Path
     line: int
@@ -39,11 +39,11 @@ class Block:
 
     @classmethod
     def of(cls, path: Path, line: int, text: bytes) -> Block:
-        """A block of the whole text."""
+        """A block with all of the text."""
         return cls(path, line, text, 0, len(text))
 
     def chunks(self) -> Iterator[tuple[int, bytes]]:
-        """Whole lines, some megabytes at a time, and the number of the first."""
+        """Chunks of complete lines, of some megabytes, and the number of each chunk's first line."""
         line, at = self.line, self.start
         while at < self.stop:
             end = min(at + _CHUNK, self.stop)
@@ -66,7 +66,7 @@ class Block:
 class KeywordLine:
     """A line that begins with a keyword."""
 
-    name: str  # in capitals, without asterisk and blanks
+    name: str  # in upper case, without asterisk and blanks
     path: Path
     line: int
 
@@ -85,10 +85,10 @@ class KeywordLine:
         raise InputError(f"{self.origin}: {self.shown} {problem}")
 
     def include(self, name: str, folders: Sequence[Path], within: Sequence[Path], n_files: int) -> Path:
-        """The file that the keyword names: beside the keyword's file, or in one of the folders.
+        """Path of the included file, relative to the keyword's file or to one of the folders.
 
-        InputError if it is missing, if it is one of the files `within` which the keyword lies, or if there are too many
-        files.
+        `within` are the files from the deck down to the keyword's file. InputError if the file is missing, if it is one
+        of `within`, or if there are too many files.
         """
         if n_files > MAX_INCLUDES:
             self.fail(f"is one of more than {MAX_INCLUDES} files; join some")
@@ -110,12 +110,12 @@ def load_warning(keyword: KeywordLine) -> str:
 
 
 def where(path: Path, line: int) -> str:
-    """File and line, as messages begin."""
+    """File and line, the beginning of a message."""
     return f"{path}: line {line}"
 
 
 def decode(text: bytes) -> str:
-    """Text in UTF-8, or else in Latin-1, in which every byte is valid."""
+    """Text from UTF-8, or else from Latin-1, where every byte is valid."""
     try:
         return text.decode()
     except UnicodeDecodeError:
@@ -123,7 +123,7 @@ def decode(text: bytes) -> str:
 
 
 def check_file(path: Path, kind: str) -> None:
-    """InputError if the path is a device or a pipe, which may have no end."""
+    """InputError if the path is a device or a pipe: its data may have no end."""
     if not path.is_file() and not path.is_dir() and path.exists():
         raise InputError(f"{path}: is a device or a pipe; give the path of {kind}")
 
@@ -132,7 +132,7 @@ def read_text(path: Path, kind: str) -> bytes:
     """The bytes of a text file, with lines that end in LF. InputError if it is missing, empty or not text."""
     try:
         check_file(path, kind)
-        # The numbers, nodes, cells and sets of a text take more memory than the text.
+        # The parsed numbers, nodes, cells and sets take more memory than the text.
         resources.check_memory(4 * path.stat().st_size, f"{path}: to read it", "use a machine with more")
         text = path.read_bytes()
     except OSError as error:
@@ -149,14 +149,14 @@ def read_text(path: Path, kind: str) -> bytes:
 
 
 def integer(text: str, origin: str) -> int:
-    """An integer; InputError if the text is no integer."""
+    """The integer in a text; InputError if there is none."""
     if not _INTEGER.fullmatch(text.strip()):
         raise InputError(f"{origin}: {_shown(text)} is not an integer; correct it")
     return int(text.strip())
 
 
 def real(text: str, origin: str) -> float:
-    """A finite number in the notation of C or Fortran; InputError if the text is no such number."""
+    """The finite number in a text, in the notation of C or Fortran; InputError if there is none."""
     match = _REAL.fullmatch(text.strip())
     value = float(f"{match[1]}e{match[2] or match[3] or 0}") if match else np.nan
     if not np.isfinite(value):
@@ -175,23 +175,21 @@ def _shown(text: str) -> str:
 def separated(
     block: Block, dtype: type[Number], comment: str, blank: Number | None = None
 ) -> tuple[NDArray[Any], Ints]:
-    """Numbers (n,) of lines with commas between them, and the count of numbers in each line (n_lines,).
+    """Comma-separated numbers (n,), and the count of numbers in each line (n_lines,).
 
-    `blank` is the value of an empty field between two commas. InputError, with file and line, for an empty field if
-    `blank` is None, and for a field that is no number.
+    `blank` is the value of an empty field between two commas; with None an empty field is an error. InputError, with
+    file and line, if a field is no number.
     """
-    values, counts = [np.empty(0, dtype)], [np.empty(0, np.int64)]
+    parts = [(np.empty(0, dtype), np.empty(0, np.int64))]
     for line, chunk in block.chunks():
-        found = parse(chunk, dtype, comment)
-        if found is None:
-            found = _parse_lines(Block.of(block.path, line, chunk), dtype, comment, blank)
-        values.append(found[0])
-        counts.append(found[1])
+        in_bulk = parse(chunk, dtype, comment)
+        parts.append(in_bulk or _parse_lines(Block.of(block.path, line, chunk), dtype, comment, blank))
+    values, counts = zip(*parts, strict=True)
     return np.concatenate(values), np.concatenate(counts)
 
 
 def parse(chunk: bytes, dtype: type[Number], comment: str) -> tuple[NDArray[Any], Ints] | None:
-    """As `separated`, in bulk; None if the chunk has more than numbers, commas and blanks."""
+    """As `separated`, but in bulk; None if the chunk has anything except numbers, commas and blanks."""
     mark = comment.encode()
     if mark in chunk:
         chunk = re.sub(rb"(?m)^[ \t]*" + re.escape(mark) + rb".*\n?", b"", chunk)
@@ -210,11 +208,11 @@ def parse(chunk: bytes, dtype: type[Number], comment: str) -> tuple[NDArray[Any]
 
 
 def _scan(text: bytes, dtype: type[Number]) -> NDArray[Any] | None:
-    """Numbers with commas between them, as exact as Python's float; None if the text has anything else."""
+    """Comma-separated numbers, as exact as Python's float; None if the text has anything else."""
     if not _one_word_per_field(text):
         return None
     with warnings.catch_warnings():
-        warnings.simplefilter("error", DeprecationWarning)  # numpy before 2.3 only warns of text that is no number
+        warnings.simplefilter("error", DeprecationWarning)  # numpy before 2.3 only warns about invalid text
         try:
             values = np.fromstring(text, np.dtype(dtype), sep=" ,")
         except (ValueError, DeprecationWarning):
@@ -223,7 +221,7 @@ def _scan(text: bytes, dtype: type[Number]) -> NDArray[Any] | None:
 
 
 def _one_word_per_field(text: bytes) -> bool:
-    """Whether each field between commas is one word, not a lone sign: numpy reads other fields as 0 or -1."""
+    """Whether each field between commas is one word and no single sign: numpy reads other fields as 0 or -1."""
     characters = np.frombuffer(text, np.uint8)
     comma = characters == ord(",")
     solid = ~comma & (characters != ord(" "))
@@ -275,7 +273,7 @@ def table(values: NDArray[Any], counts: Ints, width: int, fill: float = 0) -> ND
 def columns(text: bytes, widths: list[list[int]], dtype: type[Number]) -> NDArray[Any] | None:
     """Numbers (n_rows, n_fields) in fixed columns; a row has a line for each list of widths. Blank fields are 0.
 
-    `text` has no comments and no empty lines. None if any field is not plainly a number.
+    `text` must have no comments and no empty lines. None if a field is not a number.
     """
     text = text.translate(_PLAIN)
     characters = np.frombuffer(text, np.uint8)
@@ -286,20 +284,20 @@ def columns(text: bytes, widths: list[list[int]], dtype: type[Number]) -> NDArra
     n_lines = len(widths)
     if len(ends) % n_lines:
         return None
-    found = []
+    tables = []
     for card, fields in enumerate(widths):
         start, length = starts[card::n_lines, None], (ends - starts)[card::n_lines, None]
-        at = np.arange(sum(fields))
-        line = np.where(at < length, characters[np.minimum(start + at, len(characters) - 1)], ord(" "))
-        spread = np.full((len(line), sum(fields) + len(fields)), ord(","), np.uint8)
+        column = np.arange(sum(fields))
+        line = np.where(column < length, characters[np.minimum(start + column, len(characters) - 1)], ord(" "))
+        with_commas = np.full((len(line), sum(fields) + len(fields)), ord(","), np.uint8)
         first = 0
         for i, width in enumerate(fields):
             entry = line[:, first : first + width]
             entry[(entry == ord(" ")).all(axis=1), -1] = ord("0")
-            spread[:, first + i : first + i + width] = entry
+            with_commas[:, first + i : first + i + width] = entry
             first += width
-        values = _scan(spread.tobytes()[:-1], dtype)
+        values = _scan(with_commas.tobytes()[:-1], dtype)
         if values is None or len(values) != len(line) * len(fields):
             return None
-        found.append(values.reshape(len(line), -1))
-    return np.concatenate(found, axis=1)
+        tables.append(values.reshape(len(line), -1))
+    return np.concatenate(tables, axis=1)

@@ -8,8 +8,8 @@ from mpitled.store.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from mpitled.store.columns import read_grid, table_contents, write_columns
-from mpitled.store.files import check_hdf5, has_mpi, hdf5_version, read_rows
+from mpitled.store.columns import table_contents, write_columns
+from mpitled.store.files import has_mpi, hdf5_version, read_rows
 from mpitled.store.models import (
     check_model,
     describe_model,
@@ -36,10 +36,10 @@ from mpitled.store.results import EFG_NODE, Result, is_finished, is_result, is_u
 from mpitled.store.writer import ResultWriter, result_bytes
 
 __all__ = [
-    "CHECKPOINTS", "EFG_NODE", "PartBlock", "PartRows", "Result", "ResultWriter", "check_hdf5", "check_model",
+    "CHECKPOINTS", "EFG_NODE", "PartBlock", "PartRows", "Result", "ResultWriter", "check_model",
     "checkpoint_contents", "describe_model", "discard_checkpoints", "has_mpi", "has_partition", "hdf5_version",
     "is_checkpoint", "is_finished", "is_result", "is_unfinished", "model_arrays", "model_contents", "model_key",
-    "open_result", "partition_mark", "read_blocks", "read_checkpoint", "read_figures", "read_grid", "read_model",
+    "open_result", "partition_mark", "read_blocks", "read_checkpoint", "read_figures", "read_model",
     "read_part", "read_points", "read_remarks", "read_rows", "read_scene", "result_bytes", "table_contents",
     "unfinished_bytes", "write_checkpoint", "write_columns", "write_model", "write_partition",
 ]  # fmt: skip

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mpitled import checksum, hdf5_validation
 from mpitled.errors import InputError, damaged
+from mpitled.hdf5 import open_file
 from mpitled.store.files import (
     AGAIN,
     OneRank,
@@ -24,7 +25,6 @@ from mpitled.store.files import (
     fsync,
     make,
     matching,
-    open_file,
     read_json,
     read_rows,
     write_json,

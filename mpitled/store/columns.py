@@ -8,11 +8,11 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
-from mpitled import hdf5_validation, resources
-from mpitled.errors import InputError, damaged
-from mpitled.store.files import open_file, replacing
+from mpitled import hdf5_validation
+from mpitled.errors import damaged
+from mpitled.hdf5 import open_file
+from mpitled.store.files import replacing
 
 
 def write_columns(path: Path, groups: Mapping[str, Mapping[str, Sequence[float | str]]]) -> None:
@@ -46,21 +46,3 @@ def table_contents(path: Path) -> dict[str, dict[str, Any]]:
                 return {}
             tables[name] = {"columns": list(columns), "rows": lengths.pop()}
         return tables
-
-
-def read_grid(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Positions (n, 3) and volumes (n,) of integration points: datasets x, y, z, volume in the root group."""
-    with open_file(path) as file, damaged(path, "write it anew"):
-        names = ("x", "y", "z", "volume")
-        if missing := [name for name in names if name not in file]:
-            raise InputError(f"{path}: has no dataset '{missing[0]}'; give x, y, z and volume")
-        given = [hdf5_validation.member(file, name, path) for name in names]
-        kinds = {item.dtype.kind if isinstance(item, h5py.Dataset) else "" for item in given}
-        if not kinds <= set("fiu") or {len(item.shape or ()) for item in given} != {1} or len({*map(len, given)}) > 1:
-            raise InputError(f"{path}: x, y, z and volume are not four lists of as many numbers; correct them")
-        for item in given:
-            hdf5_validation.check_dataset(item, path)
-        # Compressed data may be a thousand times as large as the file.
-        resources.check_memory(32 * len(given[0]), f"{path}: its {len(given[0])} points", "give fewer")
-        columns = [item[...].astype(np.float64) for item in given]
-    return np.stack(columns[:3], axis=1), columns[3]

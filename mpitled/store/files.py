@@ -13,8 +13,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mpitled import checksum, hdf5_validation, resources
-from mpitled.errors import InputError, damaged
+from mpitled import checksum, resources
+from mpitled.errors import InputError
 
 #: Gap between rows, bytes, that takes as long to read as one more call of HDF5 (70 us at 3.5 GB/s).
 _GAP_BYTES = 1 << 18
@@ -46,24 +46,6 @@ def hdf5_version() -> str:
 def has_mpi() -> bool:
     """Whether several ranks can write one file."""
     return bool(h5py.get_config().mpi)
-
-
-def check_hdf5(path: Path) -> None:
-    """InputError if a file is not safe to be read by another library, see `hdf5_validation`."""
-    with open_file(path) as file, damaged(path, "write it anew"):
-        hdf5_validation.check_file(file, path)
-
-
-def open_file(path: Path) -> h5py.File:
-    """An HDF5 file, open for reading. InputError if there is no file, or it is not HDF5."""
-    # No locks: every rank reads the same file, and network file systems often refuse locks.
-    try:
-        return h5py.File(path, "r", locking=False)
-    except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file") from None
-    except OSError as error:
-        reason = "it is cut short" if "truncated" in str(error) else str(error).splitlines()[0]
-        raise InputError(f"{path}: cannot be read as HDF5 ({reason}); make it anew, or give another file") from None
 
 
 def attribute(holder: h5py.Group, name: str) -> str | int | None:

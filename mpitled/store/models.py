@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mpitled import hdf5_validation
 from mpitled.cells.kind import KINDS, CellKind
 from mpitled.errors import InputError, damaged
+from mpitled.hdf5 import open_file
 from mpitled.laws import Material, material_of
 from mpitled.model import CellBlock, Model, ModelFigures
 from mpitled.store.files import (
@@ -23,7 +24,6 @@ from mpitled.store.files import (
     attribute,
     check_free_space,
     first_damaged,
-    open_file,
     put,
     read_checked,
     read_json,

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from mpitled.cells.kind import CellKind
 from mpitled.errors import InputError, damaged
+from mpitled.hdf5 import open_file
 from mpitled.laws import Material
-from mpitled.store.files import REBUILD, attribute, check_free_space, matching, open_file, put, read_rows, replacing
+from mpitled.store.files import REBUILD, attribute, check_free_space, matching, put, read_rows, replacing
 from mpitled.store.models import (
     BlockGroup,
     block_arrays,

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from mpitled import checksum, hdf5_validation
 from mpitled.cells.kind import KINDS, CellKind
 from mpitled.errors import InputError, damaged
-from mpitled.store.files import AGAIN, attribute, checksum_of, first_damaged, matching, open_file, read_json, read_rows
+from mpitled.hdf5 import open_file
+from mpitled.store.files import AGAIN, attribute, checksum_of, first_damaged, matching, read_json, read_rows
 
 #: Version of the layout. Results of another layout are refused.
 RESULT_LAYOUT = 3
