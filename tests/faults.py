@@ -472,7 +472,7 @@ def inject(top: Path, n_kills: int = 100, seed: int = 0) -> Faults:
         ("another deck", "resume", [faults.change_deck]),
         ("another partition", "resume", [faults.change_partition]),
         ("two threads a rank", "always", [partial(faults.change_environment, **threads)]),
-        ("kernels compiled anew", "always", [partial(faults.change_environment, NUMBA_CACHE_DIR=str(top / "kernels"))]),
+        ("new cache of kernels", "always", [partial(faults.change_environment, NUMBA_CACHE_DIR=str(top / "kernels"))]),
     ]  # fmt: skip
     if can_mount():
         full = [partial(faults.fill_disc, size) for size in (100, 300, 500, 700, 900, 1200)]

@@ -229,7 +229,7 @@ MUTANTS: dict[str, list[tuple[str, str, str, str]]] = {
         ("nodes in the file's order", "rows)[order] for name", "rows) for name", f"{RESUME} -k any_order"),
     ],
     "mpitled/checksum.py": [
-        ("places do not count", "_STEPS[: len(some)] + np", "0 * _STEPS[: len(some)] + np", f"{RESUME} -k checksum"),
+        ("places do not count", "_STEPS[: len(block)] + np", "0 * _STEPS[: len(block)] + np", f"{RESUME} -k checksum"),
     ],
 }  # fmt: skip
 

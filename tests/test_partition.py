@@ -65,10 +65,10 @@ def test_edges_of_hexahedra_are_faces_in_any_numbering():
     nx, ny, nz = 5, 4, 3
     block = structured_hexahedra((nx, ny, nz))
     graph = cell_graph([solid(block)])
-    found = edges(graph)
-    assert len(found) == 2 * ((nx - 1) * ny * nz + nx * (ny - 1) * nz + nx * ny * (nz - 1))
+    joined = edges(graph)
+    assert len(joined) == 2 * ((nx - 1) * ny * nz + nx * (ny - 1) * nz + nx * ny * (nz - 1))
     i, j, k = np.unravel_index(np.arange(nx * ny * nz), (nx, ny, nz), order="F")
-    for a, b in found:
+    for a, b in joined:
         assert abs(i[a] - i[b]) + abs(j[a] - j[b]) + abs(k[a] - k[b]) == 1
 
     rng = np.random.default_rng(0)
@@ -76,17 +76,17 @@ def test_edges_of_hexahedra_are_faces_in_any_numbering():
     # Rotations of the corners about the local z axis, so that faces meet in every orientation.
     turned = np.stack([h[(np.arange(8) // 4) * 4 + (np.arange(8) + r) % 4] for h, r in zip(block, cells, strict=True)])
     shuffled = edges(cell_graph([solid(nodes[turned][cells])]))
-    assert {(cells[a], cells[b]) for a, b in shuffled} == found
+    assert {(cells[a], cells[b]) for a, b in shuffled} == joined
 
 
 @pytest.mark.parametrize("nodes", [8, 20])
 def test_edges_of_support_domains_join_nearest_domains_and_cells_with_common_nodes(nodes):
     blocks = mixed(6, nodes=nodes, share=0.4)
     graph = cell_graph(blocks)
-    found = edges(graph)
+    joined = edges(graph)
     hexahedra, domains, points = blocks[0].nodes, blocks[1].nodes, blocks[1].points
     n = len(hexahedra)
-    assert all((b, a) in found and a != b for a, b in found)
+    assert all((b, a) in joined and a != b for a, b in joined)
     assert n_components(graph) == 1
     assert graph.edge_weights.min() >= 1
 
@@ -97,7 +97,7 @@ def test_edges_of_support_domains_join_nearest_domains_and_cells_with_common_nod
         needed = [4] * n + [max(4, nodes // 2)] * (a - n)
         expected |= {(a, b) for b in range(a) if len(touched[a] & touched[b]) >= needed[b]}
     hexahedra_only = edges(cell_graph([solid(hexahedra)]))
-    assert found == expected | {(b, a) for a, b in expected} | hexahedra_only
+    assert joined == expected | {(b, a) for a, b in expected} | hexahedra_only
 
 
 def test_graph_is_connected_where_the_mesh_is():
@@ -119,12 +119,12 @@ def test_parts_have_equal_cost_and_their_tables_agree(scene, n_parts):
     assert part.dtype == np.int32
     assert set(part) == set(range(n_parts))
 
-    found = tables(blocks, part, n_parts)
-    quality = figures(found, costs(blocks), sizes(blocks), graph)
+    part_tables = tables(blocks, part, n_parts)
+    quality = figures(part_tables, costs(blocks), sizes(blocks), graph)
     # The imbalance of a bisection is at most 0.1 % or two cells; recursive bisection adds up to four cells.
     mean = quality.cost.mean()
     assert quality.cost.max() <= mean * 1.001 ** np.ceil(np.log2(n_parts)) + 4 * max(COSTS)
-    check_tables(found, blocks, part, n_parts)
+    check_tables(part_tables, blocks, part, n_parts)
 
     rows = np.repeat(np.arange(graph.n_cells), np.diff(graph.xadj))
     assert quality.cut.sum() == np.count_nonzero(part[rows] != part[graph.adjncy])
@@ -132,38 +132,38 @@ def test_parts_have_equal_cost_and_their_tables_agree(scene, n_parts):
     assert len(quality.describe().splitlines()) == n_parts + 4
 
 
-def check_tables(found: PartTables, blocks: list[Block], part: NDArray[np.int32], n_parts: int) -> None:
+def check_tables(part_tables: PartTables, blocks: list[Block], part: NDArray[np.int32], n_parts: int) -> None:
     """Compare the tables of each part with sets of nodes."""
     cells = [cell for block in blocks for cell in block.nodes.tolist()]
     of_part = [sorted({node for c in np.flatnonzero(part == p) for node in cells[c]}) for p in range(n_parts)]
     owner = {node: p for p in reversed(range(n_parts)) for node in of_part[p]}
     for p in range(n_parts):
-        own = slice(*found.cell_offsets[p : p + 2])
-        assert found.cells[own].tolist() == np.flatnonzero(part == p).tolist()
-        own = slice(*found.node_offsets[p : p + 2])
-        assert found.nodes[own].tolist() == of_part[p]
-        assert np.diff(found.owned_offsets)[p] == sum(of == p for of in owner.values())
+        own = slice(*part_tables.cell_offsets[p : p + 2])
+        assert part_tables.cells[own].tolist() == np.flatnonzero(part == p).tolist()
+        own = slice(*part_tables.node_offsets[p : p + 2])
+        assert part_tables.nodes[own].tolist() == of_part[p]
+        assert np.diff(part_tables.owned_offsets)[p] == sum(of == p for of in owner.values())
         expected = {q: sorted(set(of_part[p]) & set(of_part[q])) for q in range(n_parts) if q != p}
         expected = {q: nodes for q, nodes in expected.items() if nodes}
-        links = range(*found.neighbour_offsets[p : p + 2])
-        assert found.neighbours[links.start : links.stop].tolist() == list(expected)
+        links = range(*part_tables.neighbour_offsets[p : p + 2])
+        assert part_tables.neighbours[links.start : links.stop].tolist() == list(expected)
         for link, nodes in zip(links, expected.values(), strict=True):
-            assert found.shared[slice(*found.shared_offsets[link : link + 2])].tolist() == nodes
-    assert found.owned_offsets[-1] == len(owner)
-    assert len(found.shared_offsets) == len(found.neighbours) + 1
-    assert found.shared_offsets[-1] == len(found.shared)
+            assert part_tables.shared[slice(*part_tables.shared_offsets[link : link + 2])].tolist() == nodes
+    assert part_tables.owned_offsets[-1] == len(owner)
+    assert len(part_tables.shared_offsets) == len(part_tables.neighbours) + 1
+    assert part_tables.shared_offsets[-1] == len(part_tables.shared)
 
 
 def test_parts_without_one_kind_of_cell():
     """Both kinds of parts occur if the core is several parts wide."""
     blocks = mixed(10, core=0.7)
     part = cut(cell_graph(blocks), 32, costs(blocks))
-    found = tables(blocks, part, 32)
-    quality = figures(found, costs(blocks), sizes(blocks))
+    part_tables = tables(blocks, part, 32)
+    quality = figures(part_tables, costs(blocks), sizes(blocks))
     assert (quality.cells_of["domains"] == 0).any()
     assert (quality.cells_of["hexahedra"] == 0).any()
     assert quality.cut is None
-    check_tables(found, blocks, part, 32)
+    check_tables(part_tables, blocks, part, 32)
 
 
 def test_one_part_needs_no_metis(monkeypatch):
@@ -216,11 +216,11 @@ def test_four_million_hexahedra():
     print(f"\ngraph {time.perf_counter() - start:.1f} s")
     part = cut(graph, 2, equal)
     print(f"cut {time.perf_counter() - start:.1f} s")
-    found = tables([solid(block)], part, 2)
+    part_tables = tables([solid(block)], part, 2)
     seconds = time.perf_counter() - start
     peak = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024 / len(block)
     print(f"tables {seconds:.1f} s, peak {peak:.0f} bytes a cell")
-    print(figures(found, equal, {"hexahedra": len(block)}, graph).describe())
+    print(figures(part_tables, equal, {"hexahedra": len(block)}, graph).describe())
     # At most half of 3 minutes and 1 KB a cell, the limits for the model and its partition together.
     assert seconds < 90
     assert peak < 500

@@ -287,38 +287,38 @@ def test_vtk_reads_the_same_for_each_number_of_ranks(model_path: Path, tmp_path:
     n_hexahedra, n_efg, n_domains = len(model.hexahedra), model.n_nodes - model.n_fe_nodes, len(model.domains)
     single_part = store.read_part(model_path, 1, 0)
     all_points = np.concatenate([model.points, model.domain_points])
-    for k, seen in enumerate(frames):
+    for k, grid_data in enumerate(frames):
         for name in ("points", "connectivity", "offsets", "types", "node_id", "cell_id", "part"):
-            assert same(seen[name], frames[0][name]), name
-        node_id, cell_id, kind = seen["node_id"], seen["cell_id"], seen["kind"]
+            assert same(grid_data[name], frames[0][name]), name
+        node_id, cell_id, kind = grid_data["node_id"], grid_data["cell_id"], grid_data["kind"]
         assert np.bincount(kind).tolist() == [n_hexahedra, n_efg, n_domains]
-        assert same(seen["types"], np.array([12, 1, 1], np.uint8)[kind])
-        assert same(seen["bounds"], np.ravel([all_points.min(axis=0), all_points.max(axis=0)], order="F"))
+        assert same(grid_data["types"], np.array([12, 1, 1], np.uint8)[kind])
+        assert same(grid_data["bounds"], np.ravel([all_points.min(axis=0), all_points.max(axis=0)], order="F"))
 
         # Compare in global numbers: points, then corners of cells.
         nodes, cells = np.argsort(node_id)[n_domains:], np.argsort(cell_id)[n_efg:]
         assert same(node_id[nodes], np.arange(model.n_nodes))
         assert same(cell_id[cells], np.arange(model.n_cells))
-        assert same(seen["points"][nodes], model.points)
-        assert same(seen["node_label"][nodes], model.node_ids)
-        first = seen["offsets"][:-1]
-        corners = seen["connectivity"][first[cells[:n_hexahedra], None] + np.arange(8)]
+        assert same(grid_data["points"][nodes], model.points)
+        assert same(grid_data["node_label"][nodes], model.node_ids)
+        first = grid_data["offsets"][:-1]
+        corners = grid_data["connectivity"][first[cells[:n_hexahedra], None] + np.arange(8)]
         assert same(node_id[corners], model.hexahedra)
-        efg_nodes = seen["connectivity"][first[kind == 1]]
+        efg_nodes = grid_data["connectivity"][first[kind == 1]]
         assert same(np.sort(node_id[efg_nodes]), np.arange(model.n_fe_nodes, model.n_nodes))
-        integration_points = seen["connectivity"][first[cells[n_hexahedra:]]]
+        integration_points = grid_data["connectivity"][first[cells[n_hexahedra:]]]
         assert (node_id[integration_points] == -1).all()
-        assert same(seen["points"][integration_points], model.domain_points)
-        assert same(seen["material"][cells], model.material)
+        assert same(grid_data["points"][integration_points], model.domain_points)
+        assert same(grid_data["material"][cells], model.material)
         parts = np.zeros(model.n_cells, np.int32) if n_ranks == 1 else random_parts(model, n_ranks)
-        assert same(seen["part"][cells], parts)
+        assert same(grid_data["part"][cells], parts)
 
         point_data, cell_data, series = frame(single_part, k)
         for name, expected in point_data.items():
-            assert same(seen[name][np.concatenate([nodes, integration_points])], expected), name
-        assert same(seen["J"][cells], cell_data["J"])
-        assert np.isnan(seen["J"][kind == 1]).all()
-        assert {name: seen[name].tolist() for name in series} == {name: [value] for name, value in series.items()}
+            assert same(grid_data[name][np.concatenate([nodes, integration_points])], expected), name
+        assert same(grid_data["J"][cells], cell_data["J"])
+        assert np.isnan(grid_data["J"][kind == 1]).all()
+        assert {name: grid_data[name].tolist() for name in series} == {name: [value] for name, value in series.items()}
 
 
 def test_results_come_back_in_the_order_of_the_model(model_path: Path, tmp_path: Path) -> None:
@@ -352,8 +352,8 @@ def test_an_unfinished_file_holds_the_complete_frames(model_path: Path, tmp_path
         assert not result.complete
         assert result.n_frames == 2
         assert result.figures == ({} if end == "kill" else {"rank": 0, "steps": 7})
-        for k, seen in enumerate(frames):
-            assert same(result.point_data("parameters", k), seen["parameters"])
+        for k, grid_data in enumerate(frames):
+            assert same(result.point_data("parameters", k), grid_data["parameters"])
             assert same(result.at_nodes("parameters", k)[:, 0], np.arange(120.0) + k)
 
 

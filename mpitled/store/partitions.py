@@ -104,7 +104,7 @@ class PartBlock:
     name: str
     kind: CellKind
     n_nodes: int  # nodes per cell, k
-    n_cells: int  # cells of the block in the whole model
+    n_cells: int  # cells of the block in the model
     n_own: int  # cells of the block on this part
     first_own: int  # local number of the first cell; local cells are numbered block after block
     source: Source
@@ -142,8 +142,8 @@ class PartRows:
 
     n_parts: int
     part: int
-    n_nodes: int  # of the whole model
-    n_fe_nodes: int  # of the whole model
+    n_nodes: int  # of the model
+    n_fe_nodes: int  # of the model
     blocks: tuple[PartBlock, ...]  # all blocks of the model, in order
     nodes: NDArray[np.signedinteger]  # (k,) ascending nodes of the part's cells; int32 if n_nodes permits
     owned: NDArray[np.bool_]  # (k,)
@@ -163,7 +163,7 @@ class PartRows:
 
     @property
     def n_cells(self) -> int:
-        """Cells of the whole model."""
+        """Cells of the model."""
         return sum(block.n_cells for block in self.blocks)
 
     @property

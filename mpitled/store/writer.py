@@ -78,7 +78,7 @@ Rows = Callable[[_Section, int, int], NDArray[Any]]
 
 
 def result_bytes(rows: PartRows, n_frames: int, cell_data: Mapping[str, int]) -> int:
-    """Size in bytes of result.vtkhdf for the whole model and n_frames frames, within a few kilobytes.
+    """Size in bytes of result.vtkhdf for all parts and n_frames frames, within a few kilobytes.
 
     cell_data: components of the cell data of each frame, by name.
     """
