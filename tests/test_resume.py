@@ -43,22 +43,22 @@ OF_THE_MACHINE = {"seconds", "term_seconds", "cell_updates_per_second", "halo_sh
 
 
 def run(deck: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, stop_at: int = 0, resume: bool = False) -> Any:
-    """The report; or stop at a look, as a signal does, and give the number of looks that there were."""
-    looks, look = 0, Run._check
+    """The report; or stop at a check, as a signal does, and give the number of checks that there were."""
+    checks, check = 0, Run._check
 
     def counted(this: Run) -> None:
-        nonlocal looks
-        looks += 1
-        this.interrupts.asked = looks == stop_at
-        look(this)
+        nonlocal checks
+        checks += 1
+        this.interrupts.asked = checks == stop_at
+        check(this)
 
     with monkeypatch.context() as patch:
         patch.setattr(Run, "_check", counted)
         try:
             report = job.run(load_deck(deck), folder, World(), quiet=True, resume=resume)
         except InterruptedRun:
-            return looks
-    report["looks"] = looks
+            return checks
+    report["checks"] = checks
     return report
 
 
@@ -88,18 +88,18 @@ def test_a_run_goes_on_to_the_same_bits(tmp_path, monkeypatch, solver, millimetr
     whole = run(deck, tmp_path / "whole", monkeypatch)
     if "recover" in solver:
         assert whole["recoveries"] > 2  # twice a little, then from the beginning
-    looks = [run(deck, tmp_path / "part", monkeypatch, 10)]
+    checks = [run(deck, tmp_path / "part", monkeypatch, 10)]
     for share in (0.3, 0.4):
-        looks.append(run(deck, tmp_path / "part", monkeypatch, int(share * whole["looks"]), resume=True))
-    assert isinstance(looks[-1], int), "was not stopped"
+        checks.append(run(deck, tmp_path / "part", monkeypatch, int(share * whole["checks"]), resume=True))
+    assert isinstance(checks[-1], int), "was not stopped"
     report = run(deck, tmp_path / "part", monkeypatch, resume=True)
     assert report["resumed_at_step"] > 0
     assert held(tmp_path / "part") == held(tmp_path / "whole")
-    same = {name for name in report if name not in OF_THE_MACHINE | {"resumed_at_step", "looks"}}
+    same = {name for name in report if name not in OF_THE_MACHINE | {"resumed_at_step", "checks"}}
     assert {name: report[name] for name in same} == {name: whole[name] for name in same}
     assert not any((tmp_path / "part" / name).exists() for name in store.CHECKPOINTS)
     again = run(deck, tmp_path / "part", monkeypatch, resume=True)  # only the report is made
-    assert again["looks"] == 0
+    assert again["checks"] == 0
 
 
 @pytest.fixture

@@ -78,13 +78,13 @@ def slowest(folder, stretch, *keys):
     )
     material = model.materials[0]
     width = brentq(lambda t: first_piola(material.law, np.diag([t, t, stretch]))[0, 0], 1, stretch**-0.5 + 0.1)
-    state, step = State.at_rest(sub, 1.0, 1e-4), step_of(sub)
+    state, composed = State.at_rest(sub, 1.0, 1e-4), step_of(sub)
     n, free = sub.n_nodes, np.flatnonzero(sub.free().T)
     state.u[:, :n] = (model.points * (np.array([width, width, stretch]) - 1)).T
 
     def forces():
         state.f[:] = 0
-        step.apply_forces(state)
+        composed.apply_forces(state)
         return state.f[:, :n].T.ravel()[free]
 
     scale = np.abs(np.diff(model.points, axis=0)).max()

@@ -160,9 +160,9 @@ class Run:
             self.world.barrier()
 
     def _check_disc(self) -> None:
-        what = f"the result of {self.deck.output.frames + 1} frames"
         needed = self.output_bytes - store.unfinished_bytes(self.directory)
-        resources.check_disc(needed, self.directory, what, "lower output.frames, or give another folder")
+        frames = f"the result of {self.deck.output.frames + 1} frames"
+        resources.check_disc(needed, self.directory, frames, "lower output.frames, or give another folder")
 
     def _begin(self) -> None:
         if self.found:
@@ -213,12 +213,10 @@ class Run:
         if Method(self.deck.solver.method) is Method.QUASI_STATIC:
             with self.phases("static distance"):
                 return self._distance_by_relaxation()
-        relaxation = self.integrator
-        assert isinstance(relaxation, DynamicRelaxation)
-        if not relaxation.stalled:
-            return relaxation.distance
+        if not self._relaxation.stalled:
+            return self._relaxation.distance
         with everywhere():
-            raise self._stalled(relaxation)
+            raise self._stalled(self._relaxation)
 
     def _distance_by_relaxation(self) -> float:
         n = self.sub.n_nodes
@@ -226,17 +224,19 @@ class Run:
             ramp, energy = self.integrator.state, self.monitor.own_energy
             self.u_full_load = ramp.u[:, :n].copy()
             self._use_relaxation()
-            assert isinstance(self.integrator, DynamicRelaxation)
-            self.integrator.start_from(ramp, energy)
+            self._relaxation.start_from(ramp, energy)
             self.integrator.begin()
-        relaxation = self.integrator
-        assert isinstance(relaxation, DynamicRelaxation)
         try:
             self._advance()
         except UnstableError:
             return math.nan  # keep the result; report the distance as unknown
-        own = np.abs(relaxation.state.u[:, :n] - self.u_full_load).max()
-        return float(self.world.gather([own]).max()) + min(relaxation.distance, relaxation.best)
+        own = np.abs(self.integrator.state.u[:, :n] - self.u_full_load).max()
+        return float(self.world.gather([own]).max()) + min(self._relaxation.distance, self._relaxation.best)
+
+    @property
+    def _relaxation(self) -> DynamicRelaxation:
+        assert isinstance(self.integrator, DynamicRelaxation)
+        return self.integrator
 
     def _stalled(self, relaxation: DynamicRelaxation) -> UnstableError:
         """The error of a relaxation that has stalled. Collective."""
@@ -310,8 +310,8 @@ class Run:
         return True
 
     def _check(self) -> None:
-        asked = CHECKPOINT if time.perf_counter() >= self.next_checkpoint else 0
-        self.monitor.update(END if self.interrupts.asked else asked)
+        due = CHECKPOINT if time.perf_counter() >= self.next_checkpoint else 0
+        self.monitor.update(END if self.interrupts.asked else due)
         if self.progress and self.u_full_load is None:
             self.progress.show(self.integrator.progress, self.integrator.state.step, self.monitor.figures)
 

@@ -1,6 +1,8 @@
 """The terms of a step. A new term is a module here and a line in `TERMS`.
 
-Ledger, series, report, checkpoint and dry run iterate over this registry.
+Ledger, series, report, checkpoint and dry run iterate over this registry. A small term has `from_scene`, `apply`, a
+sentence `absent`, and what it needs of the rest: `figures` with `check` for its energies and its share of the stability
+bound, and restart fields. `tests/test_terms.py` has an example with all of them.
 """
 
 from __future__ import annotations
