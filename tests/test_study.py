@@ -116,7 +116,7 @@ def test_what_cannot_be_varied_is_said_before_anything_runs(tmp_path):
     for vary, word in (
         ("solver.load_step=1,2", "solver.load_step"),
         ("solver.tolerance", "key=value"),
-        ("a=1,2+b=3", "as many values"),
+        ("a=1,2+b=3", "equally many values"),
         ("ranks=0", "ranks = 0"),
     ):
         line = complaint(mpitled("study", CUBE, "--out", tmp_path / "study", "--vary", vary, status=2))

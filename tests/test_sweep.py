@@ -169,7 +169,7 @@ def test_charts_show_what_differs_by_names_that_fit(tmp_path, groups, monkeypatc
     summary._draw(table._replace(rows=rows), tmp_path)
     panels = [axes.get_ylabel() for axes in figures[0].axes]
     assert "largest displacement, mm" in panels
-    assert "misfit of cloud, mm" not in panels  # zero everywhere
+    assert "uncertainty of the cloud, worst\nnode, mm" not in panels  # zero everywhere
     assert figures[0].legends == []  # one series
     assert names == ["400", "500"]
     summary._draw(table._replace(keys=[*table.keys, nu], rows=rows), tmp_path)
@@ -224,14 +224,14 @@ def test_an_array_job_fits_its_sweep(tmp_path, monkeypatch):
     mpitled(*words, out, "--scheduler", "slurm", "--ranks", 2)
     assert not (out / "pbs.sh").exists()
     line = complaint(mpitled("sweep", out, "--only", 1, n=4, status=2))
-    assert "--only 1: has 2 ranks a case, and 4 started; start as many" in line
+    assert "--only 1: a case has 2 ranks, and 4 started; start as many" in line
     with monkeypatch.context() as patch:
         patch.setenv("OMPI_COMM_WORLD_SIZE", "1")
         assert "and 1 started" in complaint(mpitled("sweep", out, "--only", 1, status=2))
 
     script = Path(mpitled(*words, spaced, "--scheduler", "slurm").stdout.strip())
     assert f'#SBATCH --output="{tmp_path}/my 50%% files/slurm-%A_%a.log"' in script.read_text()
-    assert "pbs takes no such path" in complaint(mpitled(*words, spaced, "--scheduler", "pbs", status=2))
+    assert "pbs refuses this path" in complaint(mpitled(*words, spaced, "--scheduler", "pbs", status=2))
     # Submitted from any folder, by a shell that does not have the program in its path.
     monkeypatch.chdir(tmp_path)
     plan = cases.plan(deck, vary.grid(["tumour.volume=150"]), [], 1, spaced)
@@ -306,7 +306,7 @@ def test_what_cannot_be_swept_is_said_before_anything_runs(tmp_path):
     for texts, message in (
         (["solver.load_step=1,2"], "did you mean load_steps"),
         (["solver.load_steps"], "key=value"),
-        (["a=1,2+b=3"], "as many values"),
+        (["a=1,2+b=3"], "equally many values"),
         (["solver.load_steps=5", "solver.load_steps=6"], "varied twice"),
         (["solver.load_steps=5,5"], "cases 1 and 2 are the same"),
     ):
@@ -436,12 +436,12 @@ def test_a_table_is_not_replaced_by_another_one(tmp_path, command):
         assert f"remove {out / command}.json to replace it" in line
     deck.write_text(text.replace("3000", "4000"))
     line = complaint(mpitled(*words, "--vary", f"{nu}=0.3,0.4,0.45", status=2))
-    assert "of the deck before it or a file that it reads was changed" in line
+    assert "of an earlier version of the deck or of a file that it reads" in line
     if command == "sweep":  # its table can still be read
         assert "was changed since" in complaint(mpitled("sweep", out, status=2))
         for change in (lambda: None, deck.unlink):
             change()
-            note = f"note: {out}: {deck}, or a file that it reads, is not what was swept"
+            note = f"note: {out}: {deck}, or a file that it reads, has changed since the sweep"
             assert note in mpitled("report", out).stderr
             assert [row[nu] for row in open_sweep(out)] == [0.45, 0.4, 0.3]
     assert table.read_bytes() == kept
@@ -495,7 +495,7 @@ def test_one_growth_passes_through_what_runs_of_their_own_find(tmp_path):
 
 
 @pytest.mark.parametrize(("words", "reason"), [
-    (["--vary", "cloud.growth=0.3,0.4"], "tumour.volume alone"),
+    (["--vary", "cloud.growth=0.3,0.4"], "tumour.volume as the only varied key"),
     (["--vary", "tumour.volume=100,200", "--set", "solver.method=dynamic"], "not near rest"),
     (["--vary", "tumour.volume=100,200", "--scheduler", "slurm"], "no array of jobs"),
 ])  # fmt: skip

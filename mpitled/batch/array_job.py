@@ -13,15 +13,15 @@ from mpitled import atomic
 from mpitled.batch.cases import MANIFEST, Sweep
 from mpitled.errors import InputError
 
-#: Folders that every shell searches; they must not precede the folders of loaded modules.
+#: Folders in the PATH of every shell. They must not precede the folders of loaded modules.
 _SYSTEM = ("/bin", "/usr/bin", "/usr/local/bin")
 
 
 def _slurm(name: str, n: int, ranks: int, folder: str, command: str) -> tuple[str, str]:
-    """Directives, and the lines that start a task. SLURM sends a signal before the time limit."""
+    """Directives, and the commands that start a task. SLURM sends a signal before the time limit."""
     if not re.fullmatch(r"[^\n\"'\\]+", folder):
-        raise InputError(f"{folder}: slurm takes no such path for its logs; give an --out without quotes")
-    log = folder.replace("%", "%%") + "/slurm-%A_%a.log"  # %A: another log when the job is submitted again
+        raise InputError(f"{folder}: slurm refuses this path for its logs; give an --out without quotes")
+    log = folder.replace("%", "%%") + "/slurm-%A_%a.log"  # %A: each submission has its own log
     log = f'"{log}"' if re.search(r"\s", log) else log
     head = f"""\
 #SBATCH --job-name={name}
@@ -48,9 +48,9 @@ exit "$status"
 
 
 def _pbs(name: str, n: int, ranks: int, folder: str, command: str) -> tuple[str, str]:
-    """Directives, and the lines that start a task. PBS sends no signal in time: `timeout` does."""
+    """Directives, and the commands that start a task. PBS sends no signal early enough: `timeout` sends it."""
     if not re.fullmatch(r"[^\s\"'\\:,]+", folder):
-        raise InputError(f"{folder}: pbs takes no such path for its logs; give an --out without blanks and quotes")
+        raise InputError(f"{folder}: pbs refuses this path for its logs; give an --out without blanks and quotes")
     head = f"""\
 #PBS -N {name}
 #PBS -j oe
@@ -71,9 +71,9 @@ SCHEDULERS: dict[str, Callable[[str, int, int, str, str], tuple[str, str]]] = {"
 
 
 def write(sweep: Sweep, scheduler: str) -> Path:
-    """Write the script of a scheduler and the manifest; the user sets the time limit and the queue in the script.
+    """Write the manifest and the script of a scheduler, in which the user sets the time limit and the queue.
 
-    InputError if the scheduler does not accept the path of the sweep's folder.
+    Returns the path of the script. InputError if the scheduler does not accept the path of the sweep's folder.
     """
     n, ranks, folder = len(sweep.cases), sweep.ranks, sweep.folder.resolve()
     name = re.sub("[^A-Za-z0-9]", "_", folder.name)[:15].lstrip("_0123456789") or "sweep"  # as PBS requires
@@ -82,15 +82,15 @@ def write(sweep: Sweep, scheduler: str) -> Path:
     manifest = sweep.folder / MANIFEST
     before = manifest.read_bytes() if manifest.exists() else b""
     sweep.write_manifest()
-    if manifest.read_bytes() != before:  # the other scheduler's script is of other cases or ranks
+    if manifest.read_bytes() != before:  # an existing script is for other cases or ranks
         with atomic.writing(folder):
-            for other in SCHEDULERS:
-                (folder / f"{other}.sh").unlink(missing_ok=True)
+            for existing in SCHEDULERS:
+                (folder / f"{existing}.sh").unlink(missing_ok=True)
     path = sweep.folder / f"{scheduler}.sh"
     text = f"""\
 #!/usr/bin/env bash
 {head}# {count(n, "case")}, each on {count(ranks, "rank")}; set the time of the longest case, and your queue.
-# Submit the script again to resume unfinished cases from their checkpoints; completed cases stay as they are.
+# Submit the script again to resume unfinished cases from their checkpoints; completed cases are not repeated.
 # Afterwards: mpitled report {quoted}
 set -euo pipefail
 cd {shlex.quote(str(Path.cwd()))}
@@ -108,8 +108,8 @@ def _environment() -> str:
     clones = (Path.cwd(), Path(sys.prefix).parent)
     setup = [path for clone in clones if (path := clone / "jobs" / "environment.sh").is_file()]
     program = Path(sys.executable).parent
-    if not (program / "mpitled").exists() and (found := shutil.which("mpitled")):
-        program = Path(found).resolve().parent
+    if not (program / "mpitled").exists() and (command := shutil.which("mpitled")):
+        program = Path(command).resolve().parent
     lines = [f". {shlex.quote(str(path))}\n" for path in setup[:1]]
     lines += [f"export PATH={shlex.quote(str(program))}:$PATH\n"] if str(program) not in _SYSTEM else []
     return "".join(lines)

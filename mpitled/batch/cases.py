@@ -1,4 +1,4 @@
-"""The cases of a sweep: the deck with other values of some keys in each case, and a folder for each case."""
+"""The cases of a sweep: each has its own values of the varied keys, and its own folder."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ GROWTH_FRAMES = 40
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CaseRecord:
-    """One case of a sweep that was started, perhaps of a deck that has changed since."""
+    """One case of a sweep that was started. The deck may have changed since."""
 
     number: int  # from 1
     values: Values  # of the varied keys
@@ -38,7 +38,7 @@ class CaseRecord:
 
     @property
     def failure(self) -> str | None:
-        """None if the case has not ended, "" if it is completed, or the reason why it is broken."""
+        """None: the case has not ended. "": it is completed. Otherwise the reason of its failure."""
         return launch.outcome(self.folder)
 
 
@@ -46,17 +46,17 @@ class CaseRecord:
 class Case(CaseRecord):
     """One case of a sweep that can be computed."""
 
-    overrides: tuple[str, ...]  # of all cases and of this one
+    overrides: tuple[str, ...]  # of all cases, then of this case
     deck: Deck
     model: Path  # folder of the model
     shares_model: bool  # whether other cases have the same model
 
     @property
     def work(self) -> float:
-        """Estimate of the run time in arbitrary units, which only sorts the cases of one deck by their run time."""
+        """Estimate of the run time in arbitrary units, by which the cases of one deck are sorted."""
         deck, solver = self.deck, self.deck.solver
-        sized = deck.labels or deck.cylinder or deck.ellipsoid
-        edge = sized.element_size if sized else 1.0
+        geometry = deck.labels or deck.cylinder or deck.ellipsoid
+        edge = geometry.element_size if geometry else 1.0
         cells = edge**-3
         if deck.block:
             cells = math.prod(deck.block.elements)
@@ -66,14 +66,14 @@ class Case(CaseRecord):
         else:
             speed = max((section.material.wave_speed for section in deck.materials), default=1.0)
             steps = (solver.load_time + solver.hold_time) * speed / edge
-        # Cells next to a larger tumour deform more, which shortens the stable step.
+        # A larger tumour deforms the cells beside it more, which shortens the stable step.
         growth = sphere_radius(deck.tumour.volume) / deck.tumour.seed_radius if deck.tumour else 1.0
         return cells * steps * (1 + growth)
 
 
 @dataclass(frozen=True, slots=True)
 class SweepRecord:
-    """A sweep that was started, as its manifest describes it."""
+    """A sweep that was started, as in its manifest."""
 
     deck: Path
     title: str
@@ -81,7 +81,7 @@ class SweepRecord:
     cases: Sequence[CaseRecord]
     overrides: Sequence[str]  # of all cases
     ranks: int  # of each case
-    one_growth: bool  # whether only the largest tumour is run, and the other cases are interpolated in its result
+    one_growth: bool  # only the largest tumour is run; the other cases are interpolated in its result
 
     @property
     def keys(self) -> list[str]:
@@ -97,17 +97,17 @@ class Sweep(SweepRecord):
 
     @property
     def runs(self) -> Sequence[Case]:
-        """The cases that have a run of their own."""
+        """The cases that are computed by a run."""
         return (max(self.cases, key=_tumour_volume),) if self.one_growth else self.cases
 
     def write_manifest(self) -> None:
-        """Write the file from which the sweep is resumed. InputError as `manifest.write`."""
+        """Write the file from which the sweep is resumed; errors as `manifest.write`."""
         cases = [ManifestCase(number=c.number, folder=c.folder.name, values=c.values) for c in self.cases]
-        made = Manifest(
+        content = Manifest(
             deck=str(self.deck.resolve()), title=self.title, overrides=list(self.overrides), ranks=self.ranks,
             one_growth=self.one_growth, cases=cases,
         )  # fmt: skip
-        manifest.write(self.folder / MANIFEST, made)
+        manifest.write(self.folder / MANIFEST, content)
 
 
 def plan(
@@ -118,42 +118,43 @@ def plan(
     folder: Path,
     one_growth: bool = False,
 ) -> Sweep:
-    """The sweep of a deck over values of its keys; for `one_growth` see `growth`.
+    """The sweep of a deck: one case for each entry of `values`. `one_growth`: see the module `growth`.
 
-    InputError if the deck does not accept a value, or if two cases are the same.
+    InputError if the deck does not accept a value, or if two cases are equal.
     """
     scenes = []
     numbers: dict[str, int] = {}
     for number, given in enumerate(values, 1):
-        every = (*overrides, *given.overrides)
+        all_overrides = (*overrides, *given.overrides)
         scene = decks.load_deck(deck, overrides, given.overrides, given.source or "varied")
         if one_growth:
             _check_growth(scene, given)
             if scene.output.frames < GROWTH_FRAMES:
-                every = (*every, f"output.frames={GROWTH_FRAMES}")
-                scene = decks.load_deck(deck, every)
+                all_overrides = (*all_overrides, f"output.frames={GROWTH_FRAMES}")
+                scene = decks.load_deck(deck, all_overrides)
         files = included(scene)
         key = decks.scene_key(scene, files)
         if (first := numbers.setdefault(key, number)) != number:
             raise InputError(f"{given.source or deck}: cases {first} and {number} are the same; leave one out")
-        scenes.append((number, given, every, scene, key, decks.model_key(scene, files)))
+        scenes.append((number, given, all_overrides, scene, key, decks.model_key(scene, files)))
     models = [model for *_, model in scenes]
     mode = f"{ranks} one growth" if one_growth else f"{ranks}"
     cases = []
-    for number, given, every, scene, key, model in scenes:
+    for number, given, all_overrides, scene, key, model in scenes:
         name = folder_name(" ".join(f"{name}-{value}" for name, value in given.items()), f"{mode} {key}")
         model_folder = folder / "models" / hashlib.sha256(model.encode()).hexdigest()[:16]
-        cases.append(Case(number, given, folder / name, every, scene, model_folder, models.count(model) > 1))
+        shares_model = models.count(model) > 1
+        cases.append(Case(number, given, folder / name, all_overrides, scene, model_folder, shares_model))
     return Sweep(deck, cases[0].deck.title, folder, tuple(cases), tuple(overrides), ranks, one_growth)
 
 
 def _check_growth(deck: Deck, values: Values) -> None:
-    """InputError unless a larger tumour has the state of this case on its way."""
+    """InputError unless the growth of a larger tumour passes through the state of this case."""
     if list(values) != ["tumour.volume"] or deck.tumour is None:
-        raise InputError("--one-growth: is for tumour.volume alone; vary nothing else, or leave it out")
+        raise InputError("--one-growth: needs tumour.volume as the only varied key; vary no other key, or leave it out")
     if deck.solver.method != "quasi-static":
         raise InputError(
-            f'--one-growth: solver.method = "{deck.solver.method}" is not near rest while it grows; take '
+            f'--one-growth: solver.method = "{deck.solver.method}" is not near rest during the growth; give '
             '"quasi-static", or leave it out'
         )
 
@@ -163,39 +164,39 @@ def _tumour_volume(case: Case) -> float:
 
 
 def is_sweep(folder: Path) -> bool:
-    """Whether a folder is that of a sweep."""
+    """Whether a folder holds a sweep."""
     return (folder / MANIFEST).is_file()
 
 
 def _read_manifest(folder: Path) -> SweepRecord:
     path = folder / MANIFEST
     try:
-        found = Manifest.model_validate_json(path.read_bytes())
+        content = Manifest.model_validate_json(path.read_bytes())
     except FileNotFoundError:
-        raise InputError(f"{folder}: holds no sweep; give a deck, or the folder that 'mpitled sweep' wrote") from None
+        raise InputError(f"{folder}: holds no sweep; give a deck, or the folder of a sweep") from None
     except (OSError, ValueError):
         raise InputError(f"{path}: cannot be read; give the deck again with --vary or --cases") from None
-    cases = [CaseRecord(n, Values(case.values), folder / case.folder) for n, case in enumerate(found.cases, 1)]
-    growth = found.one_growth or False
-    return SweepRecord(Path(found.deck), found.title or "", folder, cases, found.overrides, found.ranks or 1, growth)
+    cases = [CaseRecord(n, Values(case.values), folder / case.folder) for n, case in enumerate(content.cases, 1)]
+    deck, title, ranks, growth = Path(content.deck), content.title or "", content.ranks or 1, bool(content.one_growth)
+    return SweepRecord(deck, title, folder, cases, content.overrides, ranks, growth)
 
 
 def read(folder: Path) -> Sweep:
-    """The sweep of a folder, to be resumed. InputError if its deck has changed."""
+    """The sweep of a folder, for its computation. InputError if its deck has changed."""
     old = _read_manifest(folder)
     sweep = plan(old.deck, [case.values for case in old.cases], old.overrides, old.ranks, folder, old.one_growth)
     if [case.folder for case in sweep.cases] != [case.folder for case in old.cases]:
         raise InputError(
-            f"{folder}: {old.deck} or a file that it reads was changed since; undo that, or give it with another --out"
+            f"{folder}: {old.deck} or a file that it reads was changed since; undo the change, or give another --out"
         )
     return sweep
 
 
 def read_record(folder: Path) -> SweepRecord:
-    """The sweep of a folder, to be tabulated; a note is printed if its deck is absent or has changed."""
+    """The sweep of a folder, for its table. Prints a note if its deck is absent or has changed."""
     try:
         return read(folder)
     except (InputError, OSError):
         old = _read_manifest(folder)
-        print(f"note: {folder}: {old.deck}, or a file that it reads, is not what was swept any more", file=sys.stderr)
+        print(f"note: {folder}: {old.deck}, or a file that it reads, has changed since the sweep", file=sys.stderr)
         return old

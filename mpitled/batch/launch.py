@@ -1,4 +1,4 @@
-"""Runs of decks in processes of their own, and how they ended: the basis of sweeps and studies."""
+"""Runs of decks in separate processes, and records of their ends: the basis of sweeps and studies."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _PR_SET_PDEATHSIG = 1  # of Linux's prctl
 
 
 def ranked(ranks: int) -> list[str]:
-    """The launcher and its arguments for several ranks; none for one rank."""
+    """The launcher and its arguments for several ranks; an empty list for one rank."""
     return ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(ranks)] if ranks > 1 else []
 
 
@@ -38,7 +38,7 @@ def command(
 
 
 class Process:
-    """A process that writes its log into a folder. The process ends when its parent is killed."""
+    """A process that writes its log into a folder. The kernel kills it when its parent ends."""
 
     def __init__(self, words: Sequence[str], folder: Path, cpu_limit: int | None = None) -> None:
         """Start a command for an existing folder; the process is killed after `cpu_limit` seconds of CPU time."""
@@ -58,7 +58,7 @@ class Process:
             )
 
     def ended(self, seconds: float | None = None) -> bool:
-        """Whether the process ended within so many seconds; None: wait for its end."""
+        """Whether the process ends within the given time, s; None: wait for its end."""
         try:
             self._process.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -67,25 +67,25 @@ class Process:
 
     @property
     def status(self) -> int:
-        """Exit status of the ended process, or minus the number of the signal that killed it."""
+        """Exit status of the ended process, or the negative number of the signal that killed it."""
         return int(self._process.returncode)
 
     @property
     def failure(self) -> str:
-        """Why the ended process failed; "" if it succeeded."""
+        """Reason of the failure of the ended process; "" if it succeeded."""
         if self.status == 0:
             return ""
-        lines = [line for line in log_lines(self.folder) if any(map(str.isalpha, line))]  # no rules of mpirun
+        lines = [line for line in log_lines(self.folder) if any(map(str.isalpha, line))]  # no ruled lines
         messages = [line.removeprefix("mpitled: ") for line in lines if line.startswith("mpitled: ")]
         if self.status < 0 and not messages:
             killed = f"killed by {signal.Signals(-self.status).name}"
             if self.status == -signal.SIGXCPU:
                 return f"{killed}: the limit of CPU time was reached"
-            return killed + (": perhaps the memory was not enough" if self.status == -signal.SIGKILL else "")
+            return killed + (": the memory may be too small" if self.status == -signal.SIGKILL else "")
         return (messages or lines or ["no reason given"])[-1]
 
     def stop(self) -> None:
-        """Interrupt the process, which writes a checkpoint, and wait for its end."""
+        """Interrupt the process, so that it writes a checkpoint, and wait for its end."""
         self._process.terminate()
         self._process.wait()
 
@@ -97,9 +97,9 @@ def log_lines(folder: Path) -> list[str]:
 
 
 def prepare(folder: Path, model: Path | None = None) -> None:
-    """Empty a folder for a run, except for locks, and link a model file into it. LockError if a run is at work there.
+    """Empty a folder for a run, except for locks, and link a model file into it.
 
-    The run uses the model if the model is that of its deck.
+    The run uses the model if it fits the run's deck. LockError if another run uses the folder.
     """
     with lock.directory_lock(folder, lock.RUN):
         for path in folder.iterdir():
@@ -116,15 +116,15 @@ def prepare(folder: Path, model: Path | None = None) -> None:
                     shutil.copyfile(model, folder / model.name)
 
 
-def record(folder: Path, failure: str, **more: str) -> None:
+def record(folder: Path, failure: str, **entries: str) -> None:
     """Record in its folder that a run ended, and the reason of its failure or ""."""
-    atomic.write_text(folder / DONE, json.dumps({"failure": failure, **more}))
+    atomic.write_text(folder / DONE, json.dumps({"failure": failure, **entries}))
 
 
 def run_apart(deck: Path, overrides: Sequence[str], ranks: int, folder: Path, cpu_limit: int | None = None) -> str:
-    """Run a deck in its folder, which is emptied first; the reason of its failure, or "".
+    """Empty a folder and run a deck in it. Returns the reason of the failure, or "".
 
-    The run is killed after `cpu_limit` seconds of CPU time. LockError if another process is at work in the folder.
+    The run is killed after `cpu_limit` seconds of CPU time. LockError if another process uses the folder.
     """
     with lock.directory_lock(folder, lock.TASK):
         prepare(folder)
@@ -135,11 +135,11 @@ def run_apart(deck: Path, overrides: Sequence[str], ranks: int, folder: Path, cp
 
 
 def about(folder: Path) -> dict[str, str]:
-    """What was recorded at the end of the run in a folder; empty if no run has ended there."""
+    """The entries that `record` wrote into a folder; empty if no run has ended there."""
     done = folder / DONE
     return dict(json.loads(done.read_text())) if done.exists() else {}
 
 
 def outcome(folder: Path) -> str | None:
-    """How the run in a folder ended: None if it has not ended, the reason of its failure, or "" for success."""
+    """The outcome of the run in a folder: None if it has not ended, "" for success, or the reason of its failure."""
     return about(folder).get("failure")

@@ -14,7 +14,7 @@ from mpitled.job import MODEL
 
 
 def _last_part(path: str) -> str:
-    """The last part of a path: a manifest cannot lead out of its own folder."""
+    """The last part of a path: a manifest cannot name files outside its folder."""
     if (name := Path(path).name) in ("", ".."):
         raise ValueError("not the name of a folder")
     return name
@@ -29,7 +29,7 @@ class ManifestCase(BaseModel):
 
 
 class Manifest(BaseModel):
-    """The content of the file. A study has no title, ranks and growth of its own."""
+    """The content of the file. A study has no title, ranks and one_growth."""
 
     deck: str
     title: str | None = None
@@ -40,9 +40,9 @@ class Manifest(BaseModel):
 
 
 def write(path: Path, manifest: Manifest) -> None:
-    """Write a manifest. Cases may be added to the manifest that is there.
+    """Write a manifest, which may replace an earlier one and add cases to it.
 
-    InputError if the earlier manifest has a completed case that the new one lacks, or if the folder is that of a run.
+    InputError if the earlier manifest has a completed case that the new one lacks, or if the folder holds a run.
     """
     if (path.parent / MODEL).exists():
         raise InputError(f"{path.parent}: is the folder of a run; give another --out")
@@ -56,7 +56,7 @@ def write(path: Path, manifest: Manifest) -> None:
 
 
 def _difference(path: Path, new: Manifest) -> str:
-    """How the earlier manifest differs from the new one; "" if no completed case would be lost."""
+    """The difference between the earlier manifest and the new one; "" if no completed case would be lost."""
     try:
         old = Manifest.model_validate_json(path.read_bytes())
         folders = {case.folder for case in new.cases}
@@ -76,7 +76,7 @@ def _difference(path: Path, new: Manifest) -> str:
         return f"{'with' if old.one_growth else 'without'} --one-growth"
     values = lost[0].values
     if any(values == case.values for case in new.cases):
-        return "of the deck before it or a file that it reads was changed"
+        return "of an earlier version of the deck or of a file that it reads"
     if all(values.keys() != case.values.keys() for case in new.cases):
         return f"over {' and '.join(values) or 'nothing'}"
     return f"with {' '.join(f'{key}={value}' for key, value in values.items())}"

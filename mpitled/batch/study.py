@@ -1,4 +1,4 @@
-"""The study of a scene: error against run time over keys that trade one for the other, each run in a process."""
+"""The study of a scene: error against run time for values of keys that affect both; a process for each run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COLUMNS = (
     "family", "value", "ranks", "max_error_mm", "rms_error_mm", "cloud_misfit_mm", "static_distance_mm", "loop_s",
     "whole_s", "steps", "cells", "cell_updates", "pareto", "is_reference", "warnings", "failure",
 )  # fmt: skip
-Row = dict[str, Any]  # by column; "" where there is no value
+Row = dict[str, Any]  # by column; "" for a missing value
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,34 +62,32 @@ def study(
     beyond: float | None,
     quiet: bool = False,
 ) -> list[Row]:
-    """Run the variants that have not been run, one after the other; a row of figures each, also as study.csv and .png.
+    """Run the variants that have not been run, one after the other, and write study.csv and study.png.
 
-    Errors (mm) are against the reference, at points farther than `beyond` (m) from prescribed edges. Without a
-    reference they are differences from the run of most cell updates: a small distance from rest does not show the
-    error of the mesh. InputError for keys and values that the deck does not accept, and for a folder that holds
-    another study, before anything runs.
+    Returns a row for each variant. Errors (mm) are against the reference, at points farther than `beyond` (m) from
+    prescribed edges. Without a reference they are differences from the run with the most cell updates: a small
+    distance from rest does not show the error of the mesh. InputError, before the first run, for keys and values that
+    the deck does not accept, and for a folder that holds another study.
     """
-    todo = list(variants(families))
-    folders = [out / variant.folder(load_deck(deck, overrides, variant.overrides)) for variant in todo]
-    runs = list(zip(todo, folders, strict=True))
+    runs = [(v, out / v.folder(load_deck(deck, overrides, v.overrides))) for v in variants(families)]
     cases = [ManifestCase(folder=folder.name, values={variant.family: variant.value}) for variant, folder in runs]
     manifest.write(out / MANIFEST, Manifest(deck=str(deck.resolve()), overrides=list(overrides), cases=cases))
     rows = []
     for i, (variant, folder) in enumerate(runs, 1):
         if (failure := launch.outcome(folder)) is None:
             if not quiet:
-                print(f"{i}/{len(todo)}: {variant.family} {variant.value}".rstrip(), file=sys.stderr, flush=True)
+                print(f"{i}/{len(runs)}: {variant.family} {variant.value}".rstrip(), file=sys.stderr, flush=True)
             failure = launch.run_apart(deck, (*overrides, *variant.overrides), variant.ranks, folder)
         rows.append(_row(variant, failure, folder))
-    done = [(row, folder) for row, folder in zip(rows, folders, strict=True) if not row["failure"]]
+    done = [(row, folder) for row, (_, folder) in zip(rows, runs, strict=True) if not row["failure"]]
     if reference is None and done:
         finest, reference = max(done, key=lambda run: run[0]["cell_updates"])
         finest["is_reference"] = True
     for row, folder in done:
         if reference and not row["is_reference"]:
             groups = compare.compare(folder, reference, beyond)["groups"]
-            found = groups["free beyond" if beyond is not None else "free"]
-            row |= {"max_error_mm": found["largest_mm"][-1], "rms_error_mm": found["rms_mm"][-1]}
+            errors = groups["free beyond" if beyond is not None else "free"]
+            row |= {"max_error_mm": errors["largest_mm"][-1], "rms_error_mm": errors["rms_mm"][-1]}
     for row in rows:
         row["pareto"] = _is_pareto(row, rows)
     atomic.write_csv(out / "study.csv", COLUMNS, rows)
@@ -98,7 +96,7 @@ def study(
 
 
 def _draw(rows: list[Row], out: Path) -> None:
-    if not any(row["max_error_mm"] for row in rows):  # all runs failed, or there is one run only
+    if not any(row["max_error_mm"] for row in rows):  # all runs failed, or there is only one run
         print(f"{out}: no picture, because there are no errors to draw", file=sys.stderr)
         return
     try:
@@ -130,7 +128,7 @@ def _row(variant: Variant, failure: str, folder: Path) -> Row:
 
 
 def _quantity(rows: list[Row]) -> str:
-    """Whether the rows have errors against a reference, or differences from one of the runs."""
+    """The kind of the errors: against a reference, or differences from one of the runs."""
     return "difference" if any(row["is_reference"] for row in rows) else "error"
 
 
@@ -144,13 +142,13 @@ def _is_pareto(row: Row, rows: list[Row]) -> bool:
 
 
 def records(rows: list[Row]) -> list[Row]:
-    """The rows for JSON: None where there is no number."""
+    """The rows for JSON: None for a missing number."""
     texts = ("value", "warnings", "failure")
     return [{name: None if v == "" and name not in texts else v for name, v in row.items()} for row in rows]
 
 
 def show(rows: list[Row]) -> None:
-    """Print the rows: * marks a run that no other beats in both error and time, ! a run with warnings."""
+    """Print the rows: * marks a Pareto optimum of error and time, ! a run with warnings."""
     numbers = {"max_error_mm": f"{_quantity(rows)}, mm", "rms_error_mm": "rms, mm", "cloud_misfit_mm": "misfit, mm"}
     numbers |= {"loop_s": "loop, s", "steps": "steps", "cells": "cells"}
     lines = []
@@ -162,4 +160,4 @@ def show(rows: list[Row]) -> None:
         lines.append((cells, row["failure"]))
     print_table(["", "family", "value", *numbers.values()], lines, n_texts=3)
     if any(row["warnings"] for row in rows):
-        print("! has warnings, in its report.json and in the column warnings of study.csv")
+        print("! the run has warnings: see its report.json, or the column warnings of study.csv")

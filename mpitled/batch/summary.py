@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,67 +18,73 @@ from mpitled.batch.vary import read_csv
 from mpitled.deck import unit_of
 from mpitled.errors import InputError
 from mpitled.results import markup
+from mpitled.results.figures import BY_KEY, Figure, look_up
 
-#: Case, varied keys, figures, warnings, failure and times of one case; "" where there is no value.
+#: Case number, varied keys, figures, warnings, failure and times of one case; "" for a missing value.
 Row = dict[str, float | str]
 
 
 class _Column(NamedTuple):
-    """A figure of report.json in the table."""
+    """A figure of report.json in the table. `results.figures` declares its label, unit and format."""
 
     name: str
     key: str  # in report.json; "." separates its levels
-    heading: str  # with its unit
-    form: str  # of a value in the rendered table
+
+    @property
+    def figure(self) -> Figure:
+        """The declaration of the key, or of the key without its last part."""
+        return BY_KEY.get(self.key) or BY_KEY[self.key.rpartition(".")[0]]
+
+    @property
+    def heading(self) -> str:
+        """Label, part and unit."""
+        part = "" if self.figure.key == self.key else self.key.rpartition(".")[2]
+        return ", ".join(filter(None, (self.figure.label, part, self.figure.unit)))
 
 
 COLUMNS = (
-    _Column("left_ml", "ventricle_volume_change_ml.left", "left ventricle, change, ml", "{:+.3f}"),
-    _Column("right_ml", "ventricle_volume_change_ml.right", "right ventricle, change, ml", "{:+.3f}"),
-    _Column("total_ml", "ventricle_volume_change_ml.total", "ventricles, change, ml", "{:+.3f}"),
-    _Column("midline_shift_mm", "midline_shift_mm", "midline, to the right, mm", "{:+.2f}"),
-    _Column("max_displacement_mm", "max_displacement_mm", "largest displacement, mm", "{:.2f}"),
-    _Column("share_over_5mm_nodes", "share_over_5mm.nodes", "over 5 mm, share of nodes", "{:.2%}"),
-    _Column("share_over_5mm_volume", "share_over_5mm.volume", "over 5 mm, share of volume", "{:.2%}"),
-    _Column("min_jacobian", "min_jacobian", "smallest J", "{:.3f}"),
-    _Column("static_distance_mm", "static_distance_mm", "from static solution, mm", "{:.4f}"),
-    _Column("cloud_misfit_mm", "cloud_misfit_mm", "misfit of cloud, mm", "{:.3f}"),
-    _Column("volume_balance_error", "volume_balance.relative_error", "volume balance, error", "{:.2%}"),
-    _Column("steps", "steps", "steps", "{:.0f}"),
-    _Column("hexahedra", "cells.hexahedra", "hexahedra", "{:.0f}"),
-    _Column("support_domains", "cells.support_domains", "support domains", "{:.0f}"),
+    _Column("left_ml", "ventricle_volume_change_ml.left"),
+    _Column("right_ml", "ventricle_volume_change_ml.right"),
+    _Column("total_ml", "ventricle_volume_change_ml.total"),
+    _Column("midline_shift_mm", "midline_shift_mm"),
+    _Column("max_displacement_mm", "max_displacement_mm"),
+    _Column("share_over_5mm_nodes", "share_over_5mm.nodes"),
+    _Column("share_over_5mm_volume", "share_over_5mm.volume"),
+    _Column("min_jacobian", "min_jacobian"),
+    _Column("static_distance_mm", "static_distance_mm"),
+    _Column("cloud_misfit_mm", "cloud_misfit_mm"),
+    _Column("volume_balance_error", "volume_balance.relative_error"),
+    _Column("steps", "steps"),
+    _Column("hexahedra", "cells.hexahedra"),
+    _Column("support_domains", "cells.support_domains"),
 )
-#: In a file of their own, because times differ whenever a sweep is repeated.
-TIMES = (
-    _Column("loop_s", "seconds.loop", "loop, s", "{:.1f}"),
-    _Column("whole_s", "seconds", "run time, s", "{:.1f}"),
-)
-#: The rendered table has a mark, and the words below the table.
-WARNINGS = _Column("warnings", "warnings", "warned", "{:.0}*")
-#: The figures with a chart and a rendered column: numbers of cells and steps are in the files only.
+#: In a separate file, because times differ whenever a sweep is repeated.
+TIMES = (_Column("loop_s", "seconds.loop"), _Column("whole_s", "seconds"))
+WARNINGS = "warnings"
+#: The figures that have a chart and a rendered column. Numbers of cells and steps are in the files only.
 _FIGURES = COLUMNS[:-3]
-_RENDERED = (WARNINGS, *_FIGURES, TIMES[-1])
-_LONGEST_NAME = 40  # of a case in a chart, characters
-#: Columns that are text even where all of their values are empty.
-_TEXTS = ("failure", WARNINGS.name)
+_MAX_NAME = 40  # of a case in a chart, characters
+_WRAP = 30  # characters in a line of an axis label
+#: Columns that are text even if all of their values are empty.
+_TEXTS = ("failure", WARNINGS)
 #: All columns of table.csv and times.csv except the case and its keys.
-NAMES = (*(column.name for column in (*COLUMNS, *TIMES, WARNINGS)), "failure")
+NAMES = (*(column.name for column in (*COLUMNS, *TIMES)), WARNINGS, "failure")
 
 
 class Table(NamedTuple):
-    """The rows of all cases, and the figures of others (`--beside`) for the same cases."""
+    """The rows of all cases, and figures from another source (`--beside`) for the same cases."""
 
     keys: list[str]  # the varied keys
     rows: list[Row]
-    others: dict[int, Row]  # by the number of the case
-    others_name: str
+    compared: dict[int, Row]  # by the number of the case
+    compared_name: str
 
 
 class _Line(NamedTuple):
     """A line of the rendered table."""
 
     cells: list[str]
-    remark: str = ""  # in place of figures
+    remark: str = ""  # replaces the figures
 
     @property
     def all(self) -> list[str]:
@@ -87,8 +94,8 @@ class _Line(NamedTuple):
 def collect(sweep: SweepRecord, beside: Path | None = None) -> Table:
     """The results of all cases: completed, broken or not computed.
 
-    `beside` is a CSV file whose columns are the varied keys and columns of this table. InputError if it is not, or if
-    the report of a completed case cannot be read.
+    `beside` is a CSV file with the varied keys and some columns of this table. InputError for other columns, and for a
+    completed case without a readable report.
     """
     rows = []
     for case in sweep.cases:
@@ -100,12 +107,12 @@ def collect(sweep: SweepRecord, beside: Path | None = None) -> Table:
                 message = f"{case.folder}: has no report ({error}); remove the folder, and sweep again"
                 raise InputError(message) from None
         row: Row = {"case": case.number} | {key: _number(case.values.get(key, "")) for key in sweep.keys}
-        row |= {column.name: _figure(report, column.key) for column in COLUMNS}
-        row |= {WARNINGS.name: "; ".join(report.get(WARNINGS.key, []))}
+        row |= {column.name: _value_of(report, column) for column in COLUMNS}
+        row |= {WARNINGS: "; ".join(report.get(WARNINGS, []))}
         row |= {"failure": "not computed" if failure is None else failure}
-        rows.append(row | {column.name: _figure(report, column.key) for column in TIMES})
-    others = _read_others(beside, sweep.keys, rows) if beside else {}
-    return Table(sweep.keys, rows, others, beside.stem if beside else "")
+        rows.append(row | {column.name: _value_of(report, column) for column in TIMES})
+    compared = _read_compared(beside, sweep.keys, rows) if beside else {}
+    return Table(sweep.keys, rows, compared, beside.stem if beside else "")
 
 
 def write(sweep: SweepRecord, table: Table) -> list[Path]:
@@ -124,8 +131,8 @@ def write(sweep: SweepRecord, table: Table) -> list[Path]:
     programs = {launch.about(case.folder).get("program") for case in sweep.cases if case.failure == ""}
     if len(programs) > 1:
         print(
-            f"note: {folder}: the cases are of {len(programs)} versions of the program; remove the older folders and "
-            "sweep again to have one",
+            f"note: {folder}: {len(programs)} versions of the program computed the cases; remove the older folders and "
+            "sweep again to have one version",
             file=sys.stderr,
         )
     return [*paths, *charts]
@@ -149,7 +156,7 @@ def show(table: Table) -> None:
 
 
 def records(table: Table) -> list[dict[str, Any]]:
-    """The rows for JSON: None where there is no number."""
+    """The rows for JSON: None for a missing number."""
     return [
         {name: None if value == "" and name not in _TEXTS else value for name, value in row.items()}
         for row in table.rows
@@ -160,8 +167,8 @@ def warnings(table: Table) -> list[str]:
     """The warnings of the cases; cases with the same warnings share a line."""
     warned: dict[str, list[str]] = {}
     for row in table.rows:
-        if text := str(row[WARNINGS.name]):
-            warned.setdefault(text, []).append(" ".join(f"{key}={_value(row[key])}" for key in table.keys))
+        if text := str(row[WARNINGS]):
+            warned.setdefault(text, []).append(" ".join(f"{key}={_format(row[key])}" for key in table.keys))
     return [f"warning for {', '.join(cases)}: {text}" for text, cases in warned.items()]
 
 
@@ -175,34 +182,33 @@ def _number(text: str) -> float | str:
         return text
 
 
-def _figure(report: Any, key: str) -> float | str:
-    for level in key.split("."):
-        report = report.get(level) if isinstance(report, dict) else None
-    if isinstance(report, dict):  # the seconds of all phases
-        return float(sum(report.values()))
-    return "" if report is None else report
+def _value_of(report: dict[str, Any], column: _Column) -> Any:
+    value = look_up(report, column.key)
+    if isinstance(value, dict):  # the seconds of all phases
+        return float(sum(value.values()))
+    return "" if value is None else value
 
 
-def _read_others(path: Path, keys: Sequence[str], rows: Sequence[Row]) -> dict[int, Row]:
-    """By case, the row of a CSV file with the same values of the varied keys."""
+def _read_compared(path: Path, keys: Sequence[str], rows: Sequence[Row]) -> dict[int, Row]:
+    """For each case, the row of a CSV file with the same values of the varied keys."""
     lines = read_csv(path, f"give a CSV of {', '.join(keys)} and figures")
     names = lines[0][1] if lines else []
     known = {column.name for column in COLUMNS}
     if missing := [key for key in keys if key not in names]:
-        raise InputError(f"{path}: has no column {missing[0]}, by which its rows belong to cases")
-    if strange := [name for name in names if name not in (*keys, *known)]:
-        raise InputError(f"{path}: {strange[0]} is no column of the table; there are {', '.join(sorted(known))}")
+        raise InputError(f"{path}: has no column {missing[0]}, which assigns its rows to cases")
+    if unknown := [name for name in names if name not in (*keys, *known)]:
+        raise InputError(f"{path}: {unknown[0]} is no column of the table; there are {', '.join(sorted(known))}")
     found: dict[int, Row] = {}
     for number, cells in lines[1:]:
-        other: Row = {name: _number(cell) for name, cell in zip(names, [*cells, *[""] * len(names)], strict=False)}
-        if wrong := [name for name in names if name in known and other[name] != "" and isinstance(other[name], str)]:
-            raise InputError(f"{path}: line {number}: {wrong[0]} = {other[wrong[0]]}: is not a number")
-        found |= {int(row["case"]): other for row in rows if all(row[key] == other[key] for key in keys)}
+        given: Row = {name: _number(cell) for name, cell in zip(names, [*cells, *[""] * len(names)], strict=False)}
+        if wrong := [name for name in names if name in known and given[name] != "" and isinstance(given[name], str)]:
+            raise InputError(f"{path}: line {number}: {wrong[0]} = {given[wrong[0]]}: is not a number")
+        found |= {int(row["case"]): given for row in rows if all(row[key] == given[key] for key in keys)}
     return found
 
 
 def _columns(rows: Sequence[Row], names: Sequence[str]) -> dict[str, list[float | str]]:
-    """Columns for HDF5: numbers, with nan where there is none, or text if any value is a word."""
+    """Columns for HDF5: numbers, with nan for missing values, or text if any value is a word."""
     columns: dict[str, list[float | str]] = {name: [row[name] for row in rows] for name in names}
     for name, values in columns.items():
         if name not in _TEXTS and all(value == "" or not isinstance(value, str) for value in values):
@@ -214,21 +220,24 @@ def _columns(rows: Sequence[Row], names: Sequence[str]) -> dict[str, list[float 
 
 
 def _rendered(table: Table) -> tuple[list[str], list[_Line]]:
-    """Headings and lines, without the columns that are empty in all cases; the figures of others follow their case."""
-    columns = [column for column in _RENDERED if any(row[column.name] != "" for row in table.rows)]
-    headings = [*map(_with_unit, table.keys), *[""] * bool(table.others_name)]
-    headings += [column.heading for column in columns] or ["figures"]  # which a remark takes the place of
+    """Headings and lines, without the columns that are empty in all cases; compared figures follow their case."""
+    columns = [c for c in (*_FIGURES, TIMES[-1]) if any(row[c.name] != "" for row in table.rows)]
+    warned, compared = any(row[WARNINGS] for row in table.rows), bool(table.compared_name)
+    headings = [*map(_with_unit, table.keys), *[""] * compared, *["warned"] * warned]
+    headings += [column.heading for column in columns] or ["figures"] * (not warned)  # a remark needs a column
 
     def cells(row: Row) -> list[str]:
-        return [c.form.format(row[c.name]) if row.get(c.name, "") != "" else "" for c in columns]
+        mark = "*" if row.get(WARNINGS) else ""
+        figures = [f"{row[c.name]:{c.figure.form}}" if row.get(c.name, "") != "" else "" for c in columns]
+        return [*[mark] * warned, *figures]
 
     lines = []
     for row in table.rows:
-        case = [*(_value(row[key]) for key in table.keys), *["here"] * bool(table.others_name)]
+        case = [*(_format(row[key]) for key in table.keys), *["here"] * compared]
         failure = str(row["failure"])
         lines.append(_Line(case, failure) if failure else _Line([*case, *cells(row)]))
-        if any(theirs := cells(table.others.get(int(row["case"]), {}))):
-            lines.append(_Line([*[""] * len(table.keys), table.others_name, *theirs]))
+        if any(figures := cells(table.compared.get(int(row["case"]), {}))):
+            lines.append(_Line([*[""] * len(table.keys), table.compared_name, *figures]))
     return headings, lines
 
 
@@ -236,7 +245,7 @@ def _with_unit(key: str) -> str:
     return f"{key}, {unit}" if (unit := unit_of(key)) else key
 
 
-def _value(value: float | str) -> str:
+def _format(value: float | str) -> str:
     return f"{value:.10g}" if isinstance(value, float) else value
 
 
@@ -249,7 +258,7 @@ def _draw(table: Table, folder: Path) -> list[Path]:
         print(f"{folder}: {message}", file=sys.stderr)
         return []
     rows = [row for row in table.rows if not row["failure"]]
-    made = []
+    written = []
     numeric = [key for key in table.keys if len({row[key] for row in rows if not isinstance(row[key], str)}) > 1]
     drawn = [column for column in _FIGURES if any(row[column.name] not in ("", 0) for row in rows)]
     if numeric and drawn:
@@ -259,27 +268,28 @@ def _draw(table: Table, folder: Path) -> list[Path]:
             if not isinstance(row[key], str):
                 name = " ".join(f"{other}={row[other]}" for other in table.keys if other != key)
                 families.setdefault(name, []).append(row)
-        if table.others_name:
-            families[table.others_name] = list(table.others.values())
-        made.append(folder / "quantities.png")
-        shares = {column.name for column in drawn if "%" in column.form}
-        charts.draw_quantities(families, key, _with_unit(key), {c.name: c.heading for c in drawn}, shares, made[-1])
+        if table.compared_name:
+            families[table.compared_name] = list(table.compared.values())
+        written.append(folder / "quantities.png")
+        shares = {column.name for column in drawn if "%" in column.figure.form}
+        labels = {column.name: textwrap.fill(column.heading, _WRAP) for column in drawn}
+        charts.draw_quantities(families, key, _with_unit(key), labels, shares, written[-1])
     if timed := [row for row in rows if row["static_distance_mm"] != "" and row["loop_s"] != ""]:
         points = [
-            (float(row["loop_s"]), float(row["static_distance_mm"]), name + (" (warned)" if row[WARNINGS.name] else ""))
+            (float(row["loop_s"]), float(row["static_distance_mm"]), name + (" (warned)" if row[WARNINGS] else ""))
             for row, name in zip(timed, _names(timed, table.keys), strict=True)
         ]
-        made.append(folder / "cost.png")
-        charts.draw_cost(points, made[-1])
-    return made
+        written.append(folder / "cost.png")
+        charts.draw_cost(points, written[-1])
+    return written
 
 
 def _names(rows: Sequence[Row], keys: Sequence[str]) -> list[str]:
-    """Names of cases in a chart: values of several keys with the last parts of the keys, if the names stay short."""
-    named = [" ".join(f"{key.rpartition('.')[2]}={_value(row[key])}" for key in keys) for row in rows]
-    if len(keys) > 1 and max(map(len, named)) <= _LONGEST_NAME:
+    """Names of cases in a chart: the values; those of several keys with short names of the keys if there is space."""
+    named = [" ".join(f"{key.rpartition('.')[2]}={_format(row[key])}" for key in keys) for row in rows]
+    if len(keys) > 1 and max(map(len, named)) <= _MAX_NAME:
         return named
-    return [" ".join(_value(row[key]) for key in keys) for row in rows]
+    return [" ".join(_format(row[key]) for key in keys) for row in rows]
 
 
 def _html(sweep: SweepRecord, table: Table, charts: Sequence[Path]) -> str:
@@ -288,8 +298,8 @@ def _html(sweep: SweepRecord, table: Table, charts: Sequence[Path]) -> str:
     captions = {
         "quantities": (
             f"Charts of the results against {table.keys[0]}",
-            "Lines join the cases in their order; nothing was computed between the cases. The misfit is the largest "
-            "residual of the cloud's fit; the volume balance is the share of the grown volume that is unaccounted for.",
+            "Lines join the cases in their order; nothing was computed between the cases. The cloud's uncertainty is "
+            "the largest residual of its fit; the error of the volume balance is the unaccounted share of the volume.",
         ),
         "cost": (
             "Chart of the distance from the static solution in mm against the time of the loop in s",

@@ -1,4 +1,4 @@
-"""Compute the cases of a sweep, longest first: in a process each, or in groups of the ranks of one MPI job."""
+"""Compute the cases of a sweep, longest first: a process for each case, or groups of the ranks of one MPI job."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ _POLL = 0.2  # s between two checks of the running processes
 def compute(
     sweep: Sweep, world: World, *, jobs: int = 1, retry: bool = False, only: int | None = None, quiet: bool = False
 ) -> None:
-    """Compute the cases that are not completed; a broken case, which `retry` computes again, does not end the others.
+    """Compute the cases that are not completed; a broken case does not stop the sweep. Collective.
 
-    On one rank `jobs` cases run at once, each on `sweep.ranks` ranks of its own. Several ranks form groups of
-    `sweep.ranks`, which take the cases in turn. `only` is the number of the one case to compute.
-    InputError on all ranks if the numbers do not fit each other, or if another process is at work on a case;
-    InterruptedRun on a signal.
+    On one rank `jobs` cases run at once, each in a process on `sweep.ranks` ranks. Several ranks form groups of
+    `sweep.ranks`, and each group computes one case after another. retry: also compute broken cases again. only: number
+    of the only case to compute. InputError on all ranks if ranks, `only` and the sweep do not fit each other, or if
+    another process computes a case; InterruptedRun on a signal.
     """
     with everywhere():
         if world.size > 1 and world.size % sweep.ranks:
-            raise InputError(f"--ranks {sweep.ranks}: {world.size} ranks are no multiple of it; start a multiple")
+            raise InputError(f"--ranks {sweep.ranks}: {world.size} ranks are not a multiple; start a multiple")
         if only is not None and world.started and world.size != sweep.ranks:
             raise InputError(
-                f"--only {only}: has {count(sweep.ranks, 'rank')} a case, and {world.size} started; start as many, or "
-                "write the array job anew with --scheduler"
+                f"--only {only}: a case has {count(sweep.ranks, 'rank')}, and {world.size} started; start as many, or "
+                "write the array job again with --scheduler"
             )
         if only is not None and not 0 < only <= len(sweep.cases):
             raise InputError(f"--only {only}: there are {len(sweep.cases)} cases; count them from 1")
@@ -50,11 +50,11 @@ def compute(
         token = world.broadcast(secrets.token_hex(4))
         unfinished = world.on_leader(lambda: [case.number for case in _reopen(cases, retry)])
         queue = sorted((case for case in cases if case.number in unfinished), key=lambda case: -case.work)
-        first = {case.model: case for case in queue if case.shares_model and not _has_model(case, sweep.ranks)}
-        models = [] if only else list(first.values())
+        shared = {case.model: case for case in queue if case.shares_model and not _has_model(case, sweep.ranks)}
+        models = [] if only else list(shared.values())
         screen = Screen(quiet)
         if world.leads and queue:
-            before = f", {len(cases) - len(queue)} of them done before" if len(queue) < len(cases) else ""
+            before = f", {len(cases) - len(queue)} of them completed before" if len(queue) < len(cases) else ""
             at_once = min(world.size // sweep.ranks if world.size > 1 else jobs, len(queue))
             logs = sweep.folder / (cases[0].folder.name if len(cases) == 1 else "*") / launch.LOG
             screen.print(f"{count(len(cases), 'case')}{before}, {at_once} at a time; logs in {logs}")
@@ -66,13 +66,13 @@ def compute(
 
 
 def _check_ended(queue: Sequence[Case]) -> None:
-    """InputError if another process is at work on a case."""
+    """InputError if another process computes a case."""
     if missing := [case for case in queue if case.failure is None]:
-        raise InputError(f"{missing[0].folder}: another run is at work there; give the command again when it has ended")
+        raise InputError(f"{missing[0].folder}: another run is at work there; repeat the command after its end")
 
 
 def _reopen(cases: Sequence[Case], retry: bool) -> list[Case]:
-    """The cases that have not ended, and with `retry` the broken ones, whose records are removed."""
+    """The cases that have not ended and, with `retry`, the broken cases, after their records are removed."""
     queue = [case for case in cases if case.failure is None or (retry and case.failure)]
     for case in queue:
         done = case.folder / launch.DONE
@@ -88,12 +88,12 @@ def _has_model(case: Case, ranks: int) -> bool:
 
 @contextmanager
 def _locked(sweep: Sweep, world: World, only: int | None) -> Iterator[None]:
-    """Write the manifest and lock the folder; the tasks of an array job share the folder instead."""
+    """Write the manifest and lock the folder. The tasks of an array job share the folder without a lock."""
     with ExitStack() as stack:
 
         def begin() -> None:
             if only is not None and is_sweep(sweep.folder):
-                return  # other tasks read the manifest
+                return  # because other tasks read the manifest
             stack.enter_context(lock.directory_lock(sweep.folder, lock.RUN, "sweep"))
             sweep.write_manifest()
             for stale in sweep.folder.glob(".claims-*"):
@@ -104,9 +104,9 @@ def _locked(sweep: Sweep, world: World, only: int | None) -> Iterator[None]:
 
 
 def _prepare(case: Case, locks: ExitStack) -> bool | None:
-    """Lock and empty the folder of a case, unless it holds a checkpoint; whether the run resumes from a checkpoint.
+    """Lock the folder of a case, and empty it unless it holds a checkpoint. Returns whether the run can resume.
 
-    None if another process is at work on the case, or has completed the case.
+    None if another process computes the case, or has completed it.
     """
     try:
         locks.enter_context(lock.directory_lock(case.folder, lock.TASK))
@@ -115,7 +115,7 @@ def _prepare(case: Case, locks: ExitStack) -> bool | None:
         try:
             if checkpoint.find(case.folder, case.deck, decks.model_key(case.deck, job.included(case.deck))):
                 return True
-        except InputError:  # the checkpoint is of another program or model, or damaged: start again
+        except InputError:  # another version or model wrote the checkpoint, or it is damaged: start again
             pass
         launch.prepare(case.folder, case.model / job.MODEL if case.shares_model else None)
     except lock.LockError:
@@ -124,9 +124,9 @@ def _prepare(case: Case, locks: ExitStack) -> bool | None:
 
 
 def _end(sweep: Sweep, case: Case, failure: str, screen: Screen) -> None:
-    """Record and print how a case ended."""
+    """Record and print the outcome of a case."""
     launch.record(case.folder, failure, program=decks.program())
-    done = sum(case.failure is not None for case in sweep.runs)  # by all groups
+    done = sum(case.failure is not None for case in sweep.runs)  # of all groups
     broken = f": broken: {failure}" if failure else ""
     screen.print(f"[{done} of {len(sweep.runs)} done] {case.label}{broken}", "red" if failure else "green")
 
@@ -135,7 +135,7 @@ def _end(sweep: Sweep, case: Case, failure: str, screen: Screen) -> None:
 
 
 def _in_processes(sweep: Sweep, models: Sequence[Case], queue: Sequence[Case], jobs: int, screen: Screen) -> None:
-    """First build the models that several cases share, then run the cases; `jobs` processes at once."""
+    """First build the models that several cases share, then run the cases, with at most `jobs` processes at once."""
     running = dict[Case, launch.Process]()
     locks = {case: ExitStack() for case in queue}
     signals = (signal.SIGTERM, signal.SIGUSR1)
@@ -154,7 +154,7 @@ def _in_processes(sweep: Sweep, models: Sequence[Case], queue: Sequence[Case], j
                     if verb == "build":
                         launch.prepare(case.model)
                         start(case, verb, case.model)
-                        screen.print(f"model of case {case.number} and others")
+                        screen.print(f"model of case {case.number} and further cases")
                     elif (resume := _prepare(case, locks[case])) is not None:
                         start(case, verb, case.folder, resume)
                     else:
@@ -163,7 +163,7 @@ def _in_processes(sweep: Sweep, models: Sequence[Case], queue: Sequence[Case], j
                     process.ended(_POLL)
                 for case in [case for case, process in running.items() if process.ended(0)]:
                     process = running.pop(case)
-                    # The run of a case reports an error of its model again.
+                    # An error in the model is reported by the run of the case.
                     if verb == "run" and not process.failure.endswith(lock.REMEDY):
                         _end(sweep, case, process.failure, screen)
                     locks[case].close()
@@ -171,14 +171,14 @@ def _in_processes(sweep: Sweep, models: Sequence[Case], queue: Sequence[Case], j
                 screen.show(shares, len(waiting))
     except KeyboardInterrupt:
         done = sum(case.failure is not None for case in sweep.runs)
-        message = f"interrupted at {done} of {len(sweep.runs)} cases; give the same command to resume"
+        message = f"interrupted after {done} of {len(sweep.runs)} cases; repeat the command to resume"
         raise InterruptedRun(message) from None
     finally:
         screen.show({}, 0)
         for process in running.values():
             process.stop()
-        for held in locks.values():
-            held.close()
+        for lock_of_case in locks.values():
+            lock_of_case.close()
         for which, handler in zip(signals, previous, strict=True):
             signal.signal(which, handler)
 
@@ -197,7 +197,7 @@ def _in_groups(
             try:
                 path, _ = job.build(case.deck, case.model)
                 job.ensure_partition(path, sweep.ranks, case.deck.partition.seed)
-            except Exception:  # the run of a case reports the error again
+            except Exception:  # the run of the case reports the error
                 pass
     world.barrier()
     for case in queue:
@@ -211,7 +211,7 @@ def _in_groups(
 
 
 def _claim(path: Path) -> bool:
-    """Whether this group is the first to create the file, also on file systems without locks."""
+    """Whether this group is the first that creates the file. It needs no locks of the file system."""
     try:
         os.close(os.open(path, os.O_CREAT | os.O_EXCL))
     except FileExistsError:
@@ -220,7 +220,7 @@ def _claim(path: Path) -> bool:
 
 
 def _run(sweep: Sweep, case: Case, group: World, screen: Screen, world: World, resume: bool) -> None:
-    """Run a case on the ranks of a group. An error that all ranks of the group raise ends this case only."""
+    """Run a case on the ranks of a group. An error on all ranks of the group ends this case only."""
     failure = ""
     path = case.folder / launch.LOG if group.leads else Path(os.devnull)
     with path.open("w") as log, redirect_stdout(log), redirect_stderr(log):
@@ -235,7 +235,7 @@ def _run(sweep: Sweep, case: Case, group: World, screen: Screen, world: World, r
                 traceback.print_exc()
             failure = str(error) or type(error).__name__
             if group.size > 1 and not getattr(error, "everywhere", False):
-                # The other ranks of the group wait for this one: only an abort ends them.
+                # The other ranks of the group wait for this rank: only an abort ends them.
                 launch.record(case.folder, f"rank {group.rank}: {failure}", program=decks.program())
                 _abort(world, error)
     if group.leads:
@@ -243,5 +243,5 @@ def _run(sweep: Sweep, case: Case, group: World, screen: Screen, world: World, r
 
 
 def _abort(world: World, error: Exception) -> NoReturn:
-    os.write(2, f"mpitled: {error}; give the same command to compute the other cases\n".encode())
+    os.write(2, f"mpitled: {error}; repeat the command to compute the other cases\n".encode())
     world.abort(getattr(error, "status", 1))

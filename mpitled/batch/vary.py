@@ -13,11 +13,11 @@ from mpitled.errors import InputError
 
 
 class Values(dict[str, str]):
-    """The value of each varied key, as in an override "key=value"."""
+    """The value of each varied key as the text of an override."""
 
     def __init__(self, values: dict[str, str], source: str = "") -> None:
         super().__init__(values)
-        self.source = source  # file and line of a table, for messages
+        self.source = source  # file and line of the values, for messages
 
     @property
     def overrides(self) -> list[str]:
@@ -26,7 +26,7 @@ class Values(dict[str, str]):
 
 
 def family(text: str) -> list[Values]:
-    """The values of "key=a,b,c" in turn.
+    """The values of "key=a,b,c". InputError for other texts.
 
     A list is one value: "block.elements=[4,4,4],[8,8,8]". Keys that vary together are joined by "+": "a=1,2+b=3,4" is
     a = 1, b = 3, then a = 2, b = 4.
@@ -39,7 +39,7 @@ def family(text: str) -> list[Values]:
             raise InputError(f"--vary {text}: is not key=value,value,...; write for example cloud.growth=0.15,0.2")
         columns[key] = column
     if len({len(column) for column in columns.values()}) > 1:
-        raise InputError(f"--vary {text}: keys that vary together need as many values each")
+        raise InputError(f"--vary {text}: keys that vary together need equally many values")
     return [Values(dict(zip(columns, row, strict=True))) for row in zip(*columns.values(), strict=True)]
 
 
@@ -53,7 +53,10 @@ def grid(vary: Sequence[str]) -> list[Values]:
 
 
 def read_csv(path: Path, needed: str) -> list[tuple[int, list[str]]]:
-    """The lines of a CSV file with their numbers; neither empty lines nor comments (#). InputError if it is no CSV."""
+    """The cells of each line of a CSV file with its number, without empty lines and comments (#).
+
+    InputError, with the remedy `needed`, if the file is no CSV.
+    """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file)
@@ -64,9 +67,9 @@ def read_csv(path: Path, needed: str) -> list[tuple[int, list[str]]]:
 
 
 def table(path: Path, results: Container[str] = ()) -> list[Values]:
-    """The cases of a CSV file: keys in the first line, then a line of values for each case; an empty cell is no value.
+    """The cases of a CSV file: keys in the first line, then a line of values for each case; empty cells are skipped.
 
-    The columns "case" and `results` are ignored: the table of a sweep can be given as it is.
+    The columns "case" and `results` are ignored, so that the table of a sweep can be given unchanged.
     """
     lines = read_csv(path, "give keys in the first line, and a line of values for each case")
     if lines and len(lines[0][1]) == 1 and ";" in lines[0][1][0]:
@@ -80,7 +83,7 @@ def table(path: Path, results: Container[str] = ()) -> list[Values]:
     for number, row in rows:
         if len(row) != len(keys):
             raise InputError(f"{path}: line {number}: has {len(row)} values for {len(keys)} keys")
-        if "case" in keys:  # the table of a sweep: every number is written as 5.0
+        if "case" in keys:  # the table of a sweep has 5.0 for 5
             row = [re.sub(r"\.0$", "", value) for value in row]
         values = {k: v for k, v in zip(keys, row, strict=True) if v and k != "case" and k not in results}
         cases.append(Values(values, f"{path}: line {number}"))
@@ -88,6 +91,6 @@ def table(path: Path, results: Container[str] = ()) -> list[Values]:
 
 
 def folder_name(label: str, content: str) -> str:
-    """A readable name that is unique for the content."""
+    """A readable name with a hash of the content."""
     readable = "".join(c if c.isalnum() or c in "._-" else "-" for c in label)
     return f"{readable[:60]}-{hashlib.sha256(content.encode()).hexdigest()[:8]}"
