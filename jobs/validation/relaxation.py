@@ -85,7 +85,7 @@ def reached(out: Path, deck: str, overrides: Sequence[str]) -> int:
     solved(out / "rest", deck, (*overrides, RELAXING, f"solver.tolerance={AT_REST}"))
     rest = field.open_field(out / "rest").parameters.T
     keys = (*ALWAYS, *overrides, RELAXING, f"solver.tolerance={NEAR}")
-    relaxation = forecast.first_rank(load_deck(HERE / f"{deck}.toml", keys), out / "rest" / "model.h5")
+    relaxation = forecast.integrator_of(load_deck(HERE / f"{deck}.toml", keys), out / "rest" / "model.h5")
     assert isinstance(relaxation, DynamicRelaxation)
     s, near, ended = relaxation.state, 0, False
     relaxation.begin()

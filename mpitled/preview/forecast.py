@@ -69,15 +69,20 @@ def forecast(deck: Deck, model: Model) -> Forecast:
     with tempfile.TemporaryDirectory() as folder:  # a rank reads its part of a model from a file
         path = Path(folder) / "model.h5"
         store.write_model(path, model, "")
-        rows, figures = store.read_part(path, 1, 0), store.read_figures(path)
-    hourglass, rule, precision = deck.hexahedra.hourglass, deck.hexahedra.gradient, PRECISIONS[deck.solver.precision]
-    sub = localise(rows, hourglass, deck.support.stabilisation, rule, precision)
-    integrator = make_integrator(Scene(sub, deck.solver, deck=deck), deck.output.frames, World(), figures)
+        integrator = integrator_of(deck, path)
     integrator.warm_up()
     integrator.begin()
     seconds, check = measure(integrator)
-    size = store.result_bytes(rows, deck.output.frames + 1, cell_data(deck))
+    size = store.result_bytes(integrator.sub.rows, deck.output.frames + 1, cell_data(deck))
     return expect(integrator, sum(seconds.values()), check, size)
+
+
+def integrator_of(deck: Deck, path: Path) -> Integrator:
+    """The integrator of a deck on one rank, at rest, for the model in a file."""
+    rows, figures = store.read_part(path, 1, 0), store.read_figures(path)
+    hourglass, rule, precision = deck.hexahedra.hourglass, deck.hexahedra.gradient, PRECISIONS[deck.solver.precision]
+    sub = localise(rows, hourglass, deck.support.stabilisation, rule, precision)
+    return make_integrator(Scene(sub, deck.solver, deck=deck), deck.output.frames, World(), figures)
 
 
 def _seconds(act: Callable[[], object]) -> float:
