@@ -1,17 +1,17 @@
-"""A model as Abaqus files of the FE mesh and the cloud, integration points as CSV, and the scene as TOML.
+"""Export a model: the FE mesh and the cloud as Abaqus files, integration points as CSV, and the scene as TOML.
 
-Numbers are in SI units and the shortest decimals that are read as the same floats, in the model's order of nodes and
-cells: the exported scene gives the same model, bit for bit. The exception is a cloud of several materials: the files
-do not hold the material of a cloud's node, so that new support domains take nodes of all materials. The scene says so.
+Numbers are in SI units, written as the shortest decimals that are read as the same floats. Nodes and cells keep the
+model's order. So the exported scene gives the same model, bit for bit, unless the cloud has several materials: the
+files do not hold the material of a node, so that support domains have nodes of all materials. The scene notes this.
 
-The materials of the Abaqus files are neo-Hookean, but of a slightly different law (see `_LAW`), and their C10 and D1
-give E and nu up to round-off: the scene has E and nu.
+Abaqus has a slightly different neo-Hookean law (see `_LAW`). C10 and D1 determine E and nu only up to round-off:
+therefore the scene has E and nu.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,20 +27,18 @@ from mpitled.model import Model
 from mpitled.readers.meshfile import MAX_ID
 
 FE, EFG, GRID, AREAS, SCENE = "fe.inp", "efg.inp", "integration_points.csv", "surface_areas.csv", "scene.toml"
-#: Sections that are not copied to the scene: the files hold constraints and spheres, materials are given by cell sets.
-_IN_FILES = ("sphere", "material", "fixed", "displaced")
-#: *ELASTIC would be hypoelastic in a step with NLGEOM: farther from the law of the model than this law.
+#: *ELASTIC is hypoelastic in a step with NLGEOM: it differs more from the law of the model than this law.
 _LAW = (
     "** mpitled has the energy mu/2 (I1 - 3) - mu ln J + lambda/2 (J - 1)^2, and Abaqus\n"
     "** C10 (J^(-2/3) I1 - 3) + (J - 1)^2/D1. With C10 = mu/2 and D1 = 2/(lambda + 2 mu/3)\n"
     "** they agree for small strain and where J = 1, and differ in large changes of volume.\n"
 )
 _ROW = 16  # numbers in a line of a set
-_CHUNK = 1 << 16  # lines that are formatted at once
+_CHUNK = 1 << 16  # lines in one piece of text
 
 
 def write_abaqus(path: Path, directory: Path) -> list[Path]:
-    """Export the model of a file into the directory; the paths written. InputError if Abaqus cannot hold the model."""
+    """Export the model of a file into a directory and return the paths. InputError if Abaqus cannot hold the model."""
     model, scene = store.read_model(path), store.read_scene(path)
     _check_names(path, model)
     model = _with_material_sets(model)
@@ -61,19 +59,19 @@ def write_abaqus(path: Path, directory: Path) -> list[Path]:
 
 
 def _check_names(path: Path, model: Model) -> None:
-    """InputError for names of sets that Abaqus cannot hold, or cannot distinguish."""
+    """InputError for names of sets that Abaqus refuses or does not distinguish."""
     for sets in (model.node_sets, model.cell_sets):
         names: dict[str, str] = {}
         for name in sets:
             other = names.setdefault(name.casefold(), name)
             if other != name:
-                raise InputError(f"{path}: sets '{other}' and '{name}' are one to Abaqus; rename one")
+                raise InputError(f"{path}: Abaqus does not distinguish sets '{other}' and '{name}'; rename one")
             if name != name.strip() or not name or any(mark in name for mark in '";\n\r'):
                 raise InputError(f"{path}: set {name!r} has a name that Abaqus cannot hold; rename it")
 
 
 def _node_numbers(model: Model) -> NDArray[np.int64]:
-    """Numbers of the nodes in the files: their own if these are unique and valid, else their rows from 1."""
+    """Numbers of the nodes in the files: those of the model if they are unique and valid, else the rows from 1."""
     ids = model.node_ids
     unique = len(np.unique(ids)) == len(ids) and ids.min() >= 1 and ids.max() <= MAX_ID
     return ids if unique else np.arange(1, len(ids) + 1)
@@ -85,11 +83,14 @@ def _with_material_sets(model: Model) -> Model:
     for i, material in enumerate(model.materials):
         cells = np.flatnonzero(model.material == i)
         if len(cells) and not _sets_of(cells, sets):
-            name = f"material {material.name}"
-            while name in sets:
-                name += "_"
-            sets[name] = cells
+            sets[_free_name(f"material {material.name}", sets)] = cells
     return replace(model, cell_sets=sets)
+
+
+def _free_name(name: str, used: Container[str]) -> str:
+    while name in used:
+        name += "_"
+    return name
 
 
 def _sets_of(cells: NDArray[np.int64], sets: dict[str, NDArray[np.int64]]) -> list[str]:
@@ -127,7 +128,7 @@ def _fe(model: Model, ids: NDArray[np.int64]) -> Iterator[str]:
 
 
 def _abaqus_law(material: Material) -> str:
-    """The material's law as Abaqus has it. InputError for a law that it does not have."""
+    """The law of a material for Abaqus. InputError unless it is neo-Hookean."""
     law = material.law
     if not isinstance(law, NeoHookean):
         raise InputError(f"material.{material.name}: Abaqus decks hold neo-hookean materials, not {law.name}")
@@ -146,8 +147,8 @@ def _efg(model: Model, ids: NDArray[np.int64]) -> Iterator[str]:
 def _nodes(ids: NDArray[np.int64], points: NDArray[np.float64]) -> Iterator[str]:
     yield "*NODE\n"
     for first in range(0, len(ids), _CHUNK):
-        some = slice(first, first + _CHUNK)
-        rows = zip(ids[some].tolist(), points[some].tolist(), strict=True)
+        chunk = slice(first, first + _CHUNK)
+        rows = zip(ids[chunk].tolist(), points[chunk].tolist(), strict=True)
         yield "".join(f"{number}, {x!r}, {y!r}, {z!r}\n" for number, (x, y, z) in rows)
 
 
@@ -159,37 +160,37 @@ def _rows(numbers: NDArray[np.int64]) -> Iterator[str]:
 def _all_sets(
     keyword: str, sets: dict[str, NDArray[np.int64]], ids: NDArray[np.int64], first: int, stop: int
 ) -> Iterator[str]:
-    """The members of the sets from node or cell `first` to `stop`; empty sets are written once, in the first file."""
+    """The members of the sets from `first` to before `stop`; empty sets are written in the first file only."""
     for name, members in sets.items():
-        own = members[(members >= first) & (members < stop)]
-        if len(own) or (not len(members) and first == 0):
+        inside = members[(members >= first) & (members < stop)]
+        if len(inside) or (not len(members) and first == 0):
             yield f"*{keyword}, {keyword}={_quoted(name)}\n"
-            numbers = ids[own].tolist()
+            numbers = ids[inside].tolist()
             yield from (", ".join(map(str, numbers[i : i + _ROW])) + "\n" for i in range(0, len(numbers), _ROW))
 
 
 def _boundary(model: Model, ids: NDArray[np.int64], first: int, stop: int) -> Iterator[str]:
-    """Fixed nodes as model data, displaced nodes as a step: by sets where whole sets are prescribed, else by nodes."""
+    """Fixed nodes as model data, displaced nodes as a step: by set if all of its nodes are prescribed, else by node."""
     value = np.full((model.n_nodes, 3), np.nan)
     value.ravel()[model.prescribed_dofs] = model.prescribed_displacements
     value[:first] = np.nan
     value[stop:] = np.nan
     fixed: list[str] = []
     displaced: list[str] = []
-    by_set: list[list[str]] = []  # sets whose nodes have different displacements: a reader finds the set again
+    by_set: list[list[str]] = []  # for each set with different displacements, so that a reader finds the set again
     for name, members in sorted(model.node_sets.items(), key=lambda item: -len(item[1])):
-        own = members[(members >= first) & (members < stop)]
+        inside = members[(members >= first) & (members < stop)]
         rows = []
-        for direction in range(3) if len(own) else ():
-            values = value[own, direction].copy()
+        for direction in range(3) if len(inside) else ():
+            values = value[inside, direction].copy()
             if np.isnan(values).any():
                 continue
             if (values == values[0]).all():
                 line = f"{_quoted(name)}, {direction + 1}, {direction + 1}"
                 (fixed if values[0] == 0 else displaced).append(f"{line}, {values[0].item()!r}\n")
             else:
-                rows += _by_node(ids[own], direction, values)
-            value[own, direction] = np.nan
+                rows += _by_node(ids[inside], direction, values)
+            value[inside, direction] = np.nan
         if rows:
             by_set.append(rows)
     for direction in range(3):
@@ -206,8 +207,8 @@ def _boundary(model: Model, ids: NDArray[np.int64], first: int, stop: int) -> It
 
 
 def _by_node(ids: NDArray[np.int64], direction: int, values: NDArray[np.float64]) -> list[str]:
-    degree = direction + 1
-    return [f"{n}, {degree}, {degree}, {at!r}\n" for n, at in zip(ids.tolist(), values.tolist(), strict=True)]
+    dof = direction + 1
+    return [f"{n}, {dof}, {dof}, {value!r}\n" for n, value in zip(ids.tolist(), values.tolist(), strict=True)]
 
 
 def _grid(model: Model) -> Iterator[str]:
@@ -218,8 +219,8 @@ def _grid(model: Model) -> Iterator[str]:
             for point in model.rows_of("support domains", members).tolist():
                 names[point] += f";{name}"
     rows = np.column_stack([model.domain_points, model.domain_volumes]).tolist()
-    for (x, y, z, volume), several in zip(rows, names, strict=True):
-        yield f"{x!r},{y!r},{z!r},{volume!r},{several[1:] or 'all'}\n"
+    for (x, y, z, volume), sets in zip(rows, names, strict=True):
+        yield f"{x!r},{y!r},{z!r},{volume!r},{sets[1:] or 'all'}\n"
 
 
 def _areas(areas: NDArray[np.float64], ids: NDArray[np.int64]) -> Iterator[str]:
@@ -239,35 +240,19 @@ def _quoted(name: str) -> str:
 
 def _scene(model: Model, scene: dict[str, Any], files: Sequence[str]) -> Iterator[str]:
     """The deck from which the model was built, with these files in place of its geometry."""
-    yield "# Written by mpitled export. Fixed and displaced nodes are in the files of [mesh]; rotations are here too.\n"
+    yield "# Written by mpitled export. Fixed and displaced nodes are in the files of [mesh], rotations are below.\n"
     if model.figures.cloud_parts > 1:
-        yield "# In the model each support domain has nodes of its own material only; made from these files, of any.\n"
-    yield from _keys({key: value for key, value in scene.items() if not isinstance(value, dict | list)})
+        yield "# In the model each support domain has nodes of its own material only, but not if built from here.\n"
     names = {"fe": FE, "efg": EFG, "integration_points": GRID, "surface_areas": AREAS}
-    mesh = {key: name for key, name in names.items() if name in files}
-    yield from _section("[mesh]", mesh | {"unit": "m", "merge_tolerance": 0.0})
-    for section, table in scene.items():
-        if isinstance(table, dict) and section not in (*GEOMETRIES, "cloud", *_IN_FILES):
-            yield from _section(f"[{section}]", table)
-    for entry in scene.get("displaced", ()):
-        if entry["rotation"]:  # the files hold the final displacement, not the arc that leads to it
-            yield from _section("[[displaced]]", entry)
-    used: set[str] = set()
+    mesh = {key: name for key, name in names.items() if name in files} | {"unit": "m", "merge_tolerance": 0.0}
+    materials: dict[str, Any] = {}
     for i, material in enumerate(model.materials):
-        name = material.name
-        while name in used:
-            name += "_"
-        used.add(name)
         if sets := _sets_of(np.flatnonzero(model.material == i), model.cell_sets):
-            keys = material.record() | {"cells": sets}
-            keys = {key: value for key, value in keys.items() if key not in ("name", "law")}
-            yield from _section(f"[material.{toml.value(name)}]", keys)
-
-
-def _section(heading: str, keys: dict[str, Any]) -> Iterator[str]:
-    yield f"\n{heading}\n"
-    yield from _keys(keys)
-
-
-def _keys(keys: dict[str, Any]) -> Iterator[str]:
-    return (f"{key} = {toml.value(value)}\n" for key, value in keys.items())
+            keys = {key: value for key, value in material.record().items() if key not in ("name", "law")}
+            materials[_free_name(material.name, materials)] = keys | {"cells": sets}
+    removed = (*GEOMETRIES, "cloud", "sphere", "material", "fixed", "displaced")
+    kept = {key: value for key, value in scene.items() if key not in removed}
+    # The files have the final displacement of rotated nodes, but not their circular path.
+    rotated = [entry for entry in scene.get("displaced", ()) if entry["rotation"]]
+    deck = {"title": scene.get("title", ""), "mesh": mesh} | kept | {"displaced": rotated, "material": materials}
+    yield "\n".join(toml.lines({key: value for key, value in deck.items() if value}))
