@@ -39,7 +39,7 @@ def test_a_new_deck_can_be_computed_as_it_is_and_tells_the_defaults(tmp_path, ki
 def test_a_new_deck_spares_what_is_there(tmp_path):
     path = tmp_path / "cylinder.toml"
     mpitled("new", "cylinder", path)
-    assert "is there already" in complaint(mpitled("new", "cylinder", path, status=2))
+    assert "exists already" in complaint(mpitled("new", "cylinder", path, status=2))
     done = mpitled("run", path, "-q", "-v", "--json", "--out", tmp_path / "out", "--set", "solver.load_time=0.2", n=2)
     # In so coarse a mesh a node below the top goes 0.01 mm farther.
     assert json.loads(done.stdout)["max_displacement_mm"] == pytest.approx(4, rel=0.01)

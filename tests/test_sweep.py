@@ -497,7 +497,7 @@ def test_one_growth_passes_through_what_runs_of_their_own_find(tmp_path):
 @pytest.mark.parametrize(("words", "reason"), [
     (["--vary", "cloud.growth=0.3,0.4"], "tumour.volume as the only varied key"),
     (["--vary", "tumour.volume=100,200", "--set", "solver.method=dynamic"], "not near rest"),
-    (["--vary", "tumour.volume=100,200", "--scheduler", "slurm"], "no array of jobs"),
+    (["--vary", "tumour.volume=100,200", "--scheduler", "slurm"], "not an array of jobs"),
 ])  # fmt: skip
 def test_one_growth_is_for_slow_loading_to_volumes(tmp_path, words, reason):
     deck, out = tmp_path / "scene.toml", tmp_path / "out"
