@@ -1,4 +1,4 @@
-"""Folders and text files. A text file is complete or absent, even if the program is killed while it writes the file."""
+"""Create folders and text files. A text file is complete or absent, even if the program is killed during writing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mpitled.errors import InputError
 
 
 def write_text(path: Path, text: str | Iterable[str]) -> None:
-    """Write UTF-8 text, at once or in chunks, to a temporary file, then rename the file. InputError if this fails."""
+    """Write UTF-8 text, given as a whole or in parts, to a temporary file and rename it. InputError if this fails."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     with writing(path):
         try:
@@ -24,7 +24,7 @@ def write_text(path: Path, text: str | Iterable[str]) -> None:
                 os.fsync(file.fileno())
             os.replace(temporary, path)
         finally:
-            with suppress(OSError):  # an error here would hide the first one
+            with suppress(OSError):  # an error of the removal would hide the first error
                 temporary.unlink()
 
 
@@ -38,7 +38,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder if it does not exist. InputError if this fails."""
+    """Create a folder if it does not exist. InputError if this fails."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -46,7 +46,7 @@ def make_folder(path: Path) -> None:
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write these columns of the rows as CSV, as `write_text` writes text."""
+    """Write columns of rows as CSV; errors as `write_text`."""
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, columns, lineterminator="\n", extrasaction="ignore")
     writer.writeheader()

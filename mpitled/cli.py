@@ -1,5 +1,5 @@
 # PYTHON_ARGCOMPLETE_OK
-"""The command line: parse the words, carry out the command, end with its exit status."""
+"""The command line: parse the arguments, execute the command, end with its exit status."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mpitled.errors import InterruptedRun, MpitledError
 
 
 def main(words: Sequence[str] | None = None) -> NoReturn:
-    """Carry out a command; exit status 0 done, 1 broken, 2 bad input, 3 unstable, 4 interrupted."""
+    """Execute a command. Exit status: 0 done, 1 error of the program, 2 bad input, 3 unstable, 4 interrupted."""
     parser = argparse.ArgumentParser(
         prog="mpitled",
         description="Brain deformation by tumour growth: coupled FE/EFG and explicit dynamics on MPI ranks.",
@@ -37,7 +37,7 @@ def main(words: Sequence[str] | None = None) -> NoReturn:
         _end(error, error.status)
     except BrokenPipeError:
         os._exit(1)
-    except KeyboardInterrupt:  # of commands without results to keep: a run and a sweep end in order
+    except KeyboardInterrupt:  # runs and sweeps handle the signal themselves
         print("mpitled: interrupted", file=sys.stderr, flush=True)
         sys.exit(InterruptedRun.status)
     except ImportError as error:
@@ -49,7 +49,7 @@ def main(words: Sequence[str] | None = None) -> NoReturn:
 
 
 def _end(error: Exception, status: int) -> NoReturn:
-    """Print one message and end all ranks: each by itself if all ranks know of the error, else by an abort."""
+    """Print one message and end all ranks: by exit if all ranks raise the error, else by an abort."""
     from mpitled.parallel.halo import World
 
     world = World()
@@ -63,7 +63,7 @@ def _end(error: Exception, status: int) -> NoReturn:
 
 def _end_without_library(error: ImportError) -> NoReturn:
     """End because a library is missing or cannot be loaded, which may be the MPI library."""
-    print(f"mpitled: {error}; 'mpitled info' says what is missing and how to get it", file=sys.stderr, flush=True)
+    print(f"mpitled: {error}; 'mpitled info' lists what is missing and its remedy", file=sys.stderr, flush=True)
     if "mpi4py.MPI" in sys.modules:
         from mpitled.parallel.halo import World
 
@@ -72,7 +72,7 @@ def _end_without_library(error: ImportError) -> NoReturn:
 
 
 def _log_phases() -> None:
-    """Print the phases of the work on stderr, with time and rank."""
+    """Print each phase of the run on stderr, with time and rank."""
     import logging
 
     from mpitled.parallel.halo import World

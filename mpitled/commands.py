@@ -1,6 +1,6 @@
-"""The commands: for each its arguments and the function that carries it out.
+"""The commands: the arguments of each command, and the function that executes it.
 
-A function imports the modules that it needs: `mpitled --help` must not wait for compilers and libraries.
+Each function imports its modules itself, so that `mpitled --help` does not load compilers and libraries.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from mpitled.batch.cases import Case, Sweep, SweepRecord
 
 _Options = argparse.Namespace
-#: Adds itself to a parser, or to a group of a parser.
+#: Adds an argument to a parser or to a group of a parser.
 _Argument = Callable[[Any], None]
-#: Carries out a command; returns its exit status, None for 0.
+#: Executes a command and returns its exit status (None: 0).
 _Function = Callable[[_Options], "int | None"]
 
-#: What `mpitled new` writes a deck for.
+#: Kinds of decks that `mpitled new` writes.
 KINDS = ("brain", "decks", "block", "cylinder", "ellipsoid")
-#: Each adds a command to the subparsers, in the order of the help; `options.command` will be its function.
+#: Each entry adds a command to the subparsers, in the order of the help. `options.command` is its function.
 COMMANDS: list[Callable[[Any], None]] = []
 
 
@@ -66,12 +66,12 @@ def _one_of(*options: _Argument, required: bool = False) -> _Argument:
 
 
 def _complete_keys(prefix: str, parsed_args: _Options | None = None, **_others: object) -> list[str]:
-    """For the shell: keys, also of the deck on the line; after "=" their values."""
+    """Completions for the shell: keys, also of the deck in the command; after "=" values."""
     from mpitled.deck import keys
 
     known = keys(getattr(parsed_args, "deck", None))
-    key, given, _ = prefix.partition("=")
-    if given:
+    key, equals, _ = prefix.partition("=")
+    if equals:
         return [f"{key}={value}" for value in known.get(key, ())]
     return [f"{name}=" for name in known if name.startswith(prefix)]
 
@@ -83,11 +83,11 @@ def _positive(text: str) -> int:
     return number
 
 
-def _scene(prefix: str = "", more: str = ", a TOML file") -> _Argument:
+def _scene(prefix: str = "", kind: str = ", a TOML file") -> _Argument:
     """The deck, its overrides, and the folder of the results."""
 
     def add(parser: Any) -> None:
-        parser.add_argument("deck", type=Path, help=f"the scene{more}")
+        parser.add_argument("deck", type=Path, help=f"the scene{kind}")
         folder = f"folder of the results (out/{prefix}NAME OF THE DECK)"
         parser.add_argument("--out", type=Path, metavar="DIR", help=folder)
         _SET(parser)
@@ -104,7 +104,7 @@ _TOGETHER = "keys that vary together: KEY=A,B+KEY=C,D"
 _MODEL = _option("model", type=Path, help="model.h5, or the folder that holds it")
 _JSON = _option("--json", action="store_true", help="JSON instead of a table")
 _QUIET = _option("-q", "--quiet", action="store_true", help="no progress and no table")
-_BESIDE = _option("--beside", type=Path, metavar="CSV", help="figures of others for a sweep's table, by its keys")
+_BESIDE = _option("--beside", type=Path, metavar="CSV", help="figures for comparison in a sweep's table, by its keys")
 
 
 def _folder(options: _Options, prefix: str = "") -> Path:
@@ -126,10 +126,10 @@ def _note(message: object) -> None:
 
 
 def _note_compilation() -> None:
-    """Print a note if the kernels have never been compiled."""
+    """Print a note if the kernels have not been compiled yet."""
     cache = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parent / "kernels" / "__pycache__")
     if not any(cache.glob("mpitled-*/**/*.nbi")):
-        _note("the kernels are compiled now, once; that takes some 15 s")
+        _note("the kernels are compiled once; this takes about 15 s")
 
 
 # --- runs ----------------------------------------------------------------------------------------------------------
@@ -142,11 +142,11 @@ def _note_compilation() -> None:
     _scene(),
     _option(
         "-v", "--verbose", action="store_true",
-        help="print each phase when it begins, with its rank, and all figures at the end; with --dry, all arrays",
+        help="print each phase at its start, with its rank, and all figures at the end; with --dry, all arrays",
     ),
     _QUIET,
     _option("--resume", action="store_true", help="resume from the last checkpoint, or from the start without one"),
-    _option("--dry", action="store_true", help="print the time and the steps that the run would take; take no step"),
+    _option("--dry", action="store_true", help="print the expected time and number of steps; compute no step"),
 )  # fmt: skip
 def _run(options: _Options) -> None:
     from mpitled.deck import load_deck
@@ -162,7 +162,7 @@ def _run(options: _Options) -> None:
         _note_compilation()
     if options.dry:
         if options.json:
-            raise InputError("run --dry: prints no JSON; mpitled check DECK --json has its figures")
+            raise InputError("run --dry: prints no JSON; use mpitled check DECK --json")
         from mpitled.preview.dry_run import dry_run
 
         text = dry_run(deck, folder, world, verbose=options.verbose)
@@ -170,24 +170,24 @@ def _run(options: _Options) -> None:
             print(text)
         return
     world.on_leader(lambda: _refuse_sweep(folder))
-    for which in INTERRUPTS:  # a signal after the end of the run is no failure of the run
+    for which in INTERRUPTS:  # a signal after the end of the run must not fail the command
         signal.signal(which, signal.SIG_IGN)
-    made = run(deck, folder, world, quiet=options.quiet, resume=options.resume)
+    figures = run(deck, folder, world, quiet=options.quiet, resume=options.resume)
     if not world.leads:
         return
     if options.quiet:
-        for text in made["warnings"]:
+        for text in figures["warnings"]:
             print(f"mpitled: warning: {text}", file=sys.stderr)
     if options.json or not options.quiet:
         from mpitled.results import report
 
-        _print(made, partial(report.table, whole=options.verbose), options)
+        _print(figures, partial(report.table, whole=options.verbose), options)
         if not options.json:
-            print(f"written to {folder}; mpitled report {folder} --html makes a page of it")
+            print(f"written to {folder}; mpitled report {folder} --html writes a page")
 
 
 def _refuse_sweep(folder: Path) -> None:
-    """InputError for the folder of a sweep: a run would hide the table of the sweep."""
+    """InputError for the folder of a sweep, whose table a run would hide."""
     from mpitled.batch.cases import is_sweep
 
     if is_sweep(folder):
@@ -196,19 +196,19 @@ def _refuse_sweep(folder: Path) -> None:
 
 @_command(
     "sweep",
-    "a table over values of keys, a run for each case; the same command resumes a sweep",
+    "a table over values of keys with a run for each case; the same command resumes a sweep",
     _JSON,
     _scene("sweep_", ", or the folder of a sweep to resume"),
     _one_of(
-        _keys("--vary", "KEY=A,B,...", f"values of a key, each with each of other keys; {_TOGETHER}; repeatable"),
+        _keys("--vary", "KEY=A,B,...", f"values of a key, combined with those of other keys; {_TOGETHER}; repeatable"),
         _option("--cases", type=Path, metavar="CSV", help="a table of cases: a line of keys, then lines of values"),
     ),
     _option("--ranks", type=_positive, metavar="R", help="ranks of each case (1); under mpirun -n N: groups of R"),
     _option("--jobs", type=_positive, default=1, metavar="J", help="cases that run at once, without mpirun (1)"),
     _option("--retry", action="store_true", help="compute broken cases again"),
     _option("--only", type=_positive, metavar="N", help="case N alone and no table, as a task of an array job"),
-    _option("--one-growth", action="store_true", help="one run for all tumour volumes, which it passes through"),
-    _option("--scheduler", choices=["slurm", "pbs"], help="write an array job, compute nothing"),
+    _option("--one-growth", action="store_true", help="one run through all tumour volumes"),
+    _option("--scheduler", choices=["slurm", "pbs"], help="write an array job instead of computing"),
     _BESIDE,
     _QUIET,
 )  # fmt: skip
@@ -238,7 +238,7 @@ def _plan(options: _Options) -> Sweep:
 
     if options.deck.is_dir():
         if options.vary or options.cases or options.set or options.out or options.ranks or options.one_growth:
-            raise InputError(f"{options.deck}: is resumed as it began; give the deck to vary, set or place it anew")
+            raise InputError(f"{options.deck}: is resumed with its own options; give the deck for other options")
         plan = cases.read(options.deck)
     elif options.vary or options.cases:
         values = vary.table(options.cases, summary.NAMES) if options.cases else vary.grid(options.vary)
@@ -247,12 +247,12 @@ def _plan(options: _Options) -> Sweep:
     else:
         raise InputError("sweep: nothing is varied; give --vary KEY=A,B,... or --cases CSV")
     if plan.one_growth and (options.scheduler or options.only):
-        raise InputError("--one-growth: is one run, and no array of jobs; leave out --scheduler and --only")
+        raise InputError("--one-growth: is a single run, not an array of jobs; leave out --scheduler and --only")
     return plan
 
 
 def _report_case(plan: Sweep, case: Case, options: _Options) -> int:
-    """Print the outcome of one case; 3 if it is broken."""
+    """Print the outcome of one case and return the exit status: 3 if the case is broken."""
     from dataclasses import replace
 
     from mpitled.batch import summary
@@ -267,7 +267,10 @@ def _report_case(plan: Sweep, case: Case, options: _Options) -> int:
 
 
 def _tabulate(sweep: SweepRecord, options: _Options, *, must_write: bool) -> int:
-    """Print the table of a sweep and write it, InputError if it must be written and cannot; 3 if a case is broken."""
+    """Print and write the table of a sweep and return the exit status: 3 if a case is broken.
+
+    If the table cannot be written: InputError with `must_write`, otherwise a note.
+    """
     from mpitled.batch import summary
 
     table = summary.collect(sweep, options.beside)
@@ -299,7 +302,7 @@ def _tabulate(sweep: SweepRecord, options: _Options, *, must_write: bool) -> int
     _scene("study_"),
     _QUIET,
     _keys("--vary", "KEY=A,B,...", f"a family of runs; {_TOGETHER}; ranks=1,2 varies the ranks; repeatable"),
-    _option("--reference", type=Path, help="reference for the errors (see compare), instead of the run of most work"),
+    _option("--reference", type=Path, help="reference for the errors (see compare); default: the run of most work"),
     _option("--beyond", type=float, metavar="MM", help="errors farther than this from prescribed edges"),
 )
 def _study(options: _Options) -> None:
@@ -319,9 +322,9 @@ def _study(options: _Options) -> None:
 
 @_command(
     "new",
-    "write a deck with comments to begin with",
+    "write a first deck with comments",
     _option("kind", choices=KINDS, help="geometry: a label image, mesh files, or a shape"),
-    _option("file", type=Path, nargs="?", help="the deck that is written (KIND.toml); -: standard output"),
+    _option("file", type=Path, nargs="?", help="path of the deck (KIND.toml); -: standard output"),
 )
 def _new(options: _Options) -> None:
     from mpitled import scaffold
@@ -335,9 +338,9 @@ def _new(options: _Options) -> None:
 
 @_command(
     "check",
-    "check a mesh file or a deck, and list its contents and what a run will take",
+    "check a mesh file or a deck, list its contents, and forecast its run",
     _JSON,
-    _option("file", type=Path, help="a mesh (Abaqus, LS-DYNA, or what meshio reads), or a deck (TOML)"),
+    _option("file", type=Path, help="a mesh (Abaqus, LS-DYNA, or a format of meshio), or a deck (TOML)"),
     _SET,
 )
 def _check(options: _Options) -> None:
@@ -355,7 +358,7 @@ def _check(options: _Options) -> None:
     "build",
     "build the model of a deck",
     _scene(),
-    _option("--ranks", type=_positive, default=1, metavar="N", help="also partition it for so many ranks"),
+    _option("--ranks", type=_positive, default=1, metavar="N", help="also partition it for N ranks"),
 )
 def _build(options: _Options) -> None:
     from mpitled.deck import load_deck
@@ -400,17 +403,17 @@ def _report(options: _Options) -> int:
 
     if cases.is_sweep(options.directory):
         return _tabulate(cases.read_record(options.directory), options, must_write=False)
-    made = report.make(options.directory)
-    _print(made.as_json(), report.table, options)
-    if options.html:
-        from mpitled.results import page
-
-        report.keep(options.directory, made.as_json())
-        print(f"written to {page.write(options.directory, made)}", file=sys.stderr)
-        return 0
+    figures = report.make(options.directory)
+    _print(figures.as_json(), report.table, options)
     try:
-        report.keep(options.directory, made.as_json())
+        report.keep(options.directory, figures.as_json())
+        if options.html:
+            from mpitled.results import page
+
+            print(f"written to {page.write(options.directory, figures)}", file=sys.stderr)
     except InputError as error:
+        if options.html:
+            raise
         _note(error)
     return 0
 
@@ -478,7 +481,7 @@ def _export(options: _Options) -> None:
 
 @_command(
     "info",
-    "versions of the libraries, and what is missing; or the contents of a file",
+    "versions of the libraries and missing libraries, or the contents of a file",
     _JSON,
     _option("file", type=Path, nargs="?", help="model, result, checkpoint, table, label image or folder of a run"),
 )

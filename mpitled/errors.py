@@ -1,4 +1,4 @@
-"""The errors that a user meets, each with the exit status of the command that ends with it."""
+"""The errors of the program, each with the exit status of the command that it ends."""
 
 from __future__ import annotations
 
@@ -8,45 +8,45 @@ from pathlib import Path
 
 
 class MpitledError(Exception):
-    """An end with a reason: one line to the user, no traceback."""
+    """An expected error: the user sees one line and no traceback."""
 
     status = 1
-    everywhere = False  # whether every rank raises it alike, so that one message is enough and none need be aborted
+    everywhere = False  # whether every rank raises the error, so that one message is enough and no abort is needed
 
 
 class InputError(MpitledError):
-    """Bad input: names the file, the line or key, and the remedy."""
+    """Bad input. The message names the file, the line or key, and the remedy."""
 
     status = 2
 
 
 class UnstableError(MpitledError):
-    """The computation cannot go on: names the cell, the place and what to change."""
+    """The computation cannot continue. The message names the cell, its position and the remedy."""
 
     status = 3
 
 
 class InterruptedRun(MpitledError):
-    """Ended from outside (Ctrl-C, SIGTERM); what was written is readable, and the run can go on from there."""
+    """A signal (Ctrl-C, SIGTERM) ended the run. The files are readable, and the run can be resumed."""
 
     status = 4
 
 
 @contextmanager
 def damaged(path: Path, remedy: str) -> Iterator[None]:
-    """What goes wrong inside, with the contents of a file of ours that others may have changed, as an InputError."""
+    """Turn any error inside into an InputError: the file, which this program wrote, was damaged or changed."""
     try:
         yield
     except MpitledError:
         raise
-    except Exception as error:  # of h5py, json and numpy, each of which raises what it likes
-        reason = " ".join(str(error).split())[:100] or "it does not fit together"
+    except Exception as error:  # h5py, json and numpy raise errors of many types
+        reason = " ".join(str(error).split())[:100] or "its contents are inconsistent"
         raise InputError(f"{path}: is damaged ({type(error).__name__}: {reason}); {remedy}") from error
 
 
 @contextmanager
 def everywhere() -> Iterator[None]:
-    """What is raised inside is raised on every rank alike: the command need not abort the others."""
+    """Mark errors inside as raised on every rank, so that the command does not abort the other ranks."""
     try:
         yield
     except MpitledError as error:

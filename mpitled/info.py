@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 from mpitled import __version__
 from mpitled.errors import InputError, damaged
 
-_MOST_LABELS = 200  # labels that are listed
-_Description = tuple[str, list[tuple[str, str]]]  # heading, and lines of a name and a value
+_MAX_LABELS = 200  # labels that are listed
+_Description = tuple[str, list[tuple[str, str]]]  # heading; name and value of each line
 _SETUP = "bash jobs/brain.sh sets it up, or see jobs/environment.sh"
 
 
@@ -29,7 +29,7 @@ class _Part(NamedTuple):
 
 
 def table() -> str:
-    """The version of each part, then the purpose of each missing part and how to install it."""
+    """The version of each part; for each missing part its purpose and the command that installs it."""
     parts = _parts()
     lines = [f"{part.name:<12}{part.version or 'missing'}" for part in parts]
     for part in parts:
@@ -40,7 +40,7 @@ def table() -> str:
 
 
 def complete() -> bool:
-    """Whether a run on several ranks has all that it needs."""
+    """Whether all parts for runs on several ranks are installed."""
     return not any(part.needed and part.version is None for part in _parts())
 
 
@@ -50,9 +50,9 @@ def versions() -> dict[str, str | None]:
 
 
 def contents(path: Path) -> dict[str, Any]:
-    """The kind and contents of a model, result, checkpoint, table or label image, for JSON; all data is read first.
+    """The kind and contents of a model, result, checkpoint, table or label image, for JSON, after a check of all data.
 
-    InputError if the file is none of these, or is damaged. Tables have no checksums: only their outlines are read.
+    Tables have no checksums: only their structure is read. InputError for damaged files and for files of other kinds.
     """
     from mpitled.meshing import label_image
 
@@ -61,23 +61,23 @@ def contents(path: Path) -> dict[str, Any]:
         return {"kind": "image", "path": str(path), **label_image.contents(path)}
     if path.is_file() and (redirection := _redirection(path)):
         raise InputError(f"{path}: {redirection}")
-    with damaged(path, "build the model anew, or run the deck again"):
+    with damaged(path, "build the model again, or run the deck again"):
         return _contents(path)
 
 
 def _file_of(path: Path) -> Path:
-    """The file itself; for the folder of a run its result, or its model if there is no result."""
+    """The file itself; in the folder of a run its result, or its model if there is no result."""
     if not path.is_dir():
         return path
     candidates = (path / name for name in ("result.partial.vtkhdf", "result.vtkhdf", "model.h5"))
-    found = next(filter(Path.exists, candidates), None)
-    if found is None:
+    file = next(filter(Path.exists, candidates), None)
+    if file is None:
         raise InputError(f"{path}: is a folder without a result or a model; give a file, or the folder of a run")
-    return found
+    return file
 
 
 def _redirection(path: Path) -> str:
-    """The command or program that reads files with this name, and what they are; "" for files of this command."""
+    """The kind of a file that this command does not read, and the command or program that does; "" for other files."""
     from mpitled.deck import OF_MESHES
 
     if path.name == "report.json":
@@ -98,9 +98,9 @@ def _contents(path: Path) -> dict[str, Any]:
     if tables := store.table_contents(path):
         return {"kind": "table", "path": str(path), "tables": tables}
     if store.is_checkpoint(path):
-        found = store.checkpoint_contents(path)
+        checkpoint = store.checkpoint_contents(path)
         names = ("version", "ranks", "step", "share", "frames")
-        return {"kind": "checkpoint", "path": str(path)} | {name: found[name] for name in names}
+        return {"kind": "checkpoint", "path": str(path)} | {name: checkpoint[name] for name in names}
     with store.open_result(path) as result:
         result.check()
         metadata, times = result.metadata, result.times
@@ -125,52 +125,52 @@ def _contents(path: Path) -> dict[str, Any]:
 def describe(path: Path) -> str:
     """The contents of a file as text; errors as `contents`."""
     path = _file_of(path)
-    found = contents(path)
-    heading, rows = _DESCRIPTIONS[found["kind"]](found)
+    figures = contents(path)
+    heading, rows = _DESCRIPTIONS[figures["kind"]](figures)
     return "\n".join([f"{path}: {heading}", *(f"{name:<16} {value}" if name else value for name, value in rows)])
 
 
-def _describe_model(found: dict[str, Any]) -> _Description:
+def _describe_model(figures: dict[str, Any]) -> _Description:
     from mpitled import store
 
-    return "a whole model of mpitled", [("", store.describe_model(Path(found["path"])))]
+    return "a whole model of mpitled", [("", store.describe_model(Path(figures["path"])))]
 
 
-def _describe_image(found: dict[str, Any]) -> _Description:
-    volumes = found["labels_ml"]
-    extent = ", ".join(f"{axis} {low:.6g} to {high:.6g}" for axis, (low, high) in found["extent_mm"].items())
+def _describe_image(figures: dict[str, Any]) -> _Description:
+    volumes = figures["labels_ml"]
+    extent = ", ".join(f"{axis} {low:.6g} to {high:.6g}" for axis, (low, high) in figures["extent_mm"].items())
     rows = [
-        ("voxels", " x ".join(map(str, found["voxels"]))),
-        ("voxel", f"{' x '.join(f'{edge:.6g}' for edge in found['voxel_mm'])} mm"),
+        ("voxels", " x ".join(map(str, figures["voxels"]))),
+        ("voxel", f"{' x '.join(f'{edge:.6g}' for edge in figures['voxel_mm'])} mm"),
         ("extent", f"{extent} mm, to the right, front and top"),
-        *(("label", f"{label}: {ml:.3f} ml") for label, ml in list(volumes.items())[:_MOST_LABELS]),
+        *(("label", f"{label}: {ml:.3f} ml") for label, ml in list(volumes.items())[:_MAX_LABELS]),
     ]
-    if len(volumes) > _MOST_LABELS:
-        rows.append(("", f"{len(volumes) - _MOST_LABELS} more; the image may hold intensities, and no labels"))
+    if len(volumes) > _MAX_LABELS:
+        rows.append(("", f"{len(volumes) - _MAX_LABELS} more; the image may hold intensities instead of labels"))
     return f"an image of {len(volumes)} labels", rows
 
 
-def _describe_table(found: dict[str, Any]) -> _Description:
-    tables = found["tables"].items()
+def _describe_table(figures: dict[str, Any]) -> _Description:
+    tables = figures["tables"].items()
     return "tables of mpitled", [(name, f"{of['rows']} rows of {', '.join(of['columns'])}") for name, of in tables]
 
 
-def _describe_checkpoint(found: dict[str, Any]) -> _Description:
-    rows = [("step", f"{found['step']}, {found['share']:.1%} of the run")]
-    rows += [(name, str(found[name])) for name in ("frames", "ranks")]
-    return f"a whole checkpoint of mpitled {found['version']}", rows
+def _describe_checkpoint(figures: dict[str, Any]) -> _Description:
+    rows = [("step", f"{figures['step']}, {figures['share']:.1%} of the run")]
+    rows += [(name, str(figures[name])) for name in ("frames", "ranks")]
+    return f"a whole checkpoint of mpitled {figures['version']}", rows
 
 
-def _describe_result(found: dict[str, Any]) -> _Description:
-    if "load_share" in found:
-        reached = f"{found['load_share']:.1%} of the load"
+def _describe_result(figures: dict[str, Any]) -> _Description:
+    if "load_share" in figures:
+        reached = f"{figures['load_share']:.1%} of the load"
     else:
-        reached = f"{found['time_s']:g} s of {found['load_time_s']:g} s"
-    rows = [("title", found["title"]), ("frames", f"{found['frames']}, to {reached}")]
+        reached = f"{figures['time_s']:g} s of {figures['load_time_s']:g} s"
+    rows = [("title", figures["title"]), ("frames", f"{figures['frames']}, to {reached}")]
     names = ("nodes", "hexahedra", "support_domains", "ranks")
-    rows += [(name.replace("_", " "), str(found[name])) for name in names]
-    rows.append(("versions", ", ".join(f"{name} {version}" for name, version in found["versions"].items())))
-    return f"{'a whole' if found['complete'] else 'an unfinished'} result of mpitled", rows
+    rows += [(name.replace("_", " "), str(figures[name])) for name in names]
+    rows.append(("versions", ", ".join(f"{name} {version}" for name, version in figures["versions"].items())))
+    return f"{'a whole' if figures['complete'] else 'an unfinished'} result of mpitled", rows
 
 
 _DESCRIPTIONS: dict[str, Callable[[dict[str, Any]], _Description]] = {
@@ -224,7 +224,7 @@ def _installed(name: str) -> str | None:
 
 
 def _reported(module: str, function: str) -> str | None:
-    """The version that a library reports to a function of ours; None if it is missing, or cannot be loaded."""
+    """The version of a library from a function of this program; None if the library is missing or cannot be loaded."""
     try:
         return str(getattr(importlib.import_module(module), function)())
     except (ImportError, OSError, RuntimeError) as error:

@@ -1,6 +1,6 @@
-"""The Python interface for notebooks: decks, models, runs, and results that are read on access.
+"""The Python interface for notebooks: decks, models, runs, and results, which are read on access.
 
-Results are in SI units; reports are in the units that their keys name.
+Results are in SI units. The keys of reports name their units.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ _LARGEST = 1 << 30
 
 
 def build_model(deck: Deck | str | Path, overrides: str | Sequence[str] = ()) -> Model:
-    """The discrete model of a deck, in memory. InputError if the mesh and the deck do not fit each other.
+    """The discrete model of a deck, in memory. Overrides, "section.key=value", need a deck that is given as a path.
 
-    Overrides, "section.key=value", apply to a deck that is given as a path.
+    InputError if the mesh and the deck do not fit each other.
     """
-    return model_build.build(_loaded(deck, overrides))
+    return model_build.build(_load(deck, overrides))
 
 
 def run(
@@ -45,24 +45,24 @@ def run(
     quiet: bool = True,
     resume: bool = False,
 ) -> Any:
-    """Compute a deck into a directory on this process, or on all ranks under mpirun; the content of report.json.
+    """Compute a deck into a directory on this process, or on all ranks of mpirun. Returns the content of report.json.
 
     `resume` continues from the last checkpoint in the directory, if there is one. Overrides, "section.key=value",
-    apply to a deck that is given as a path. InputError, UnstableError or InterruptedRun on all ranks.
+    need a deck that is given as a path. InputError, UnstableError or InterruptedRun on all ranks.
     """
-    return job.run(_loaded(deck, overrides), Path(directory), World(), quiet=quiet, resume=resume)
+    return job.run(_load(deck, overrides), Path(directory), World(), quiet=quiet, resume=resume)
 
 
-def _loaded(deck: Deck | str | Path, overrides: str | Sequence[str]) -> Deck:
+def _load(deck: Deck | str | Path, overrides: str | Sequence[str]) -> Deck:
     if not isinstance(deck, Deck):
         return load_deck(deck, overrides)
     if overrides:
-        raise InputError("overrides: apply to a deck given as a path; give them to load_deck")
+        raise InputError("overrides: need the path of a deck; give them to load_deck")
     return deck
 
 
 def open_result(path: str | Path) -> RunResult:
-    """The result of a run, from its folder or its result.vtkhdf. InputError if there is none."""
+    """The result in the folder of a run or in a result.vtkhdf. InputError if the file is absent or damaged."""
     return RunResult(store.open_result(Path(path)))
 
 
@@ -92,12 +92,12 @@ class Frames(Sequence[NDArray[Any]]):
 
     def __getitem__(self, frame: Any) -> Any:
         if not -self._n_frames <= frame < self._n_frames:
-            raise IndexError(f"there are {self._n_frames} frames, and no {frame}")
+            raise IndexError(f"there are {self._n_frames} frames, but no frame {frame}")
         return self._read(frame % self._n_frames)
 
 
 class RunResult:
-    """The result of a run, read on access; nodes and cells are in the model's order."""
+    """The result of a run, read on access. Nodes and cells are in the model's order."""
 
     def __init__(self, result: store.Result) -> None:
         self._open: store.Result | None = result
@@ -123,7 +123,7 @@ class RunResult:
     @property
     def _result(self) -> store.Result:
         if self._open is None:
-            raise InputError(f"{self.path}: is closed; read it before the end of `with`, or open it again")
+            raise InputError(f"{self.path}: is closed; read it inside `with`, or open it again")
         return self._open
 
     @property
@@ -138,19 +138,19 @@ class RunResult:
 
     @property
     def displacement(self) -> Frames:
-        """(n_nodes, 3), m, in each frame: the field u_h, at EFG nodes as well."""
+        """(n_nodes, 3), m, in each frame: the field u_h, also at EFG nodes."""
         return self._frames(lambda frame: self._result.at_nodes("displacement", frame))
 
     @property
     def jacobian(self) -> Frames:
-        """(n_cells,), det F of hexahedra, then of support domains, in each frame."""
+        """(n_cells,), 1, in each frame: det F of hexahedra, then of support domains."""
         return self._frames(lambda frame: self._result.in_cells("J", frame))
 
     @property
     def stress(self) -> Frames:
-        """(n_cells, 6), Pa, in each frame: Cauchy stress of hexahedra, then of support domains; xx, yy, zz, xy, yz, xz.
+        """(n_cells, 6), Pa, in each frame: Cauchy stress xx, yy, zz, xy, yz, xz of hexahedra, then of support domains.
 
-        Pressures of neighbouring cells alternate (checkerboard) if Poisson's ratio is near 0.5: average over
+        If Poisson's ratio is near 0.5, pressures alternate between neighbouring cells (checkerboard): average over
         neighbours. InputError if the run wrote no stress.
         """
         if "stress" not in self._result.names("Cell"):
@@ -159,7 +159,7 @@ class RunResult:
 
     @property
     def history(self) -> dict[str, NDArray[np.float64]]:
-        """Energies (J) and other numbers, (n_frames,), by name, with "time"; for pandas.DataFrame."""
+        """Energies (J) and further series, each (n_frames,), by name, with "time"; for pandas.DataFrame."""
         return {"time": self.times, **self._result.series}
 
     @property
@@ -169,15 +169,15 @@ class RunResult:
         try:
             return dict(json.loads(path.read_text(encoding="utf-8")))
         except (OSError, ValueError) as error:
-            raise InputError(f"{path}: cannot be read ({error}); make it: mpitled report {path.parent}") from None
+            raise InputError(f"{path}: cannot be read ({error}); write it: mpitled report {path.parent}") from None
 
     def to_pyvista(self, frame: int = -1) -> Any:
-        """A frame as pyvista.UnstructuredGrid, undeformed, in metres. InputError without PyVista.
+        """A frame as an undeformed pyvista.UnstructuredGrid, in metres. InputError without PyVista.
 
-        Points are nodes and integration points, with the "displacement" (m) of the field. Cells are hexahedra (kind 0),
-        a vertex for each EFG node (kind 1), and a vertex at the integration point of each support domain (kind 2).
-        "J", and "stress" (Pa) if the run wrote it, are nan at EFG nodes; "material" is the number of the material in
-        the deck, from 0, and -1 at EFG nodes.
+        Points are nodes and integration points, with their "displacement" (m). Cells are hexahedra (kind 0), a vertex
+        for each EFG node (kind 1), and a vertex at the integration point of each support domain (kind 2). "J", and
+        "stress" (Pa) if the run wrote it, are nan at EFG nodes. "material" is the index of the material in the deck, -1
+        at EFG nodes.
         """
         try:
             from mpitled.results import solid
@@ -188,7 +188,7 @@ class RunResult:
         return self._frames(lambda frame: solid.frame_grid(self._result, frame))[frame]
 
     def to_xarray(self) -> Any:
-        """All frames as xarray.Dataset. InputError if they are larger than a gigabyte."""
+        """All frames as xarray.Dataset. InputError without xarray, and if the frames are larger than 1 GiB."""
         try:
             import xarray
         except ImportError:

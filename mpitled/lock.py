@@ -1,4 +1,4 @@
-"""Locks on folders: one process at a time. The operating system releases a lock when its process ends."""
+"""Locks on folders for one process at a time. The operating system releases a lock when its process ends."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import IO
 from mpitled import atomic
 from mpitled.errors import InputError
 
-#: Lock file of a process that computes into a folder, and of one that starts such a process and records its outcome.
+#: Lock file of a process that computes into a folder, and of a process that starts a run and records its outcome.
 RUN, TASK = ".lock", ".task.lock"
 REMEDY = "is at work there; wait for its end, or give another --out"
 
@@ -23,9 +23,9 @@ class LockError(InputError):
 
 @contextmanager
 def directory_lock(folder: Path, name: str, owner: str = "run") -> Iterator[None]:
-    """Hold the lock `name` of a folder, which is made if need be. LockError if another `owner` holds the lock.
+    """Hold the lock `name` of a folder, which is created if necessary. Without effect on a file system without locks.
 
-    On a file system without locks the folder is not locked.
+    LockError if another process, called `owner` in the message, holds the lock.
     """
     atomic.make_folder(folder)
     path = folder / name
@@ -51,7 +51,7 @@ def directory_lock(folder: Path, name: str, owner: str = "run") -> Iterator[None
 
 
 def _is_file_at(file: IO[str], path: Path) -> bool:
-    """Whether the path still names this open file."""
+    """Whether the path still leads to this open file."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), path.stat())
     except OSError:

@@ -1,4 +1,4 @@
-"""`mpitled new`: a first deck, whose comments, units and defaults are those of the deck's schema."""
+"""`mpitled new`: write a first deck. Its comments, units and defaults come from the deck's schema."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import tomlkit
 from mpitled import atomic, deck, toml
 from mpitled.errors import InputError
 
-#: A label image that a clone of the repository has; others give their own.
+#: The label image in a clone of the repository.
 _IMAGE = Path(__file__).parents[1] / "jobs" / "data" / "mni152_labels_1mm.nii.gz"
 _BRAIN = "material.brain = {youngs_modulus = 3000.0, poissons_ratio = 0.49}"
 #: The values that are not defaults, by kind of scene.
@@ -41,18 +41,18 @@ ellipsoid = {{semi_axes = [40.0, 32.0, 32.0], cloud = "core"}}
 tumour = {{centre = [0.0, 0.0, 0.0], volume = 523.6}}
 fixed = [{{nodes = "surface"}}]""",
 }
-#: The block whose meshes are written beside a deck of meshes.
+#: The block that gives the meshes for a deck with mesh files.
 _SAMPLE = f"""{_BRAIN}
 block = {{size = [40.0, 20.0, 20.0], elements = [8, 5, 5], cloud = "core"}}
 fixed = [{{nodes = "x0"}}]"""
-#: Sections that every deck shows, with their defaults if there is nothing to choose.
+#: Sections that every deck shows, also if all of their keys have defaults.
 _SHOWN = ("cloud", "support", "hexahedra", "solver", "output", "partition")
 
 
 def write(kind: str, path: Path) -> list[Path]:
-    """Write a deck, and the meshes that it reads; their paths. InputError if the deck exists already."""
+    """Write a deck and the meshes that it reads, and return their paths. InputError if the deck exists already."""
     if path.exists():
-        raise InputError(f"{path}: is there already; give another name, or remove it")
+        raise InputError(f"{path}: exists already; give another name, or remove it")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -63,7 +63,7 @@ def write(kind: str, path: Path) -> list[Path]:
 
 
 def text(kind: str, path: Path, meshes: Sequence[Path] = ()) -> str:
-    """The deck for a path; InputError if it reads meshes and none are given."""
+    """The text of a deck for a path. InputError if the deck needs meshes and none are given."""
     scene: dict[str, Any] = tomlkit.parse(_SCENES[kind]).unwrap()
     if kind == "brain":
         scene["labels"] = {"image": os.path.relpath(_IMAGE, path.parent) if _IMAGE.exists() else "labels.nii.gz"}
@@ -73,8 +73,8 @@ def text(kind: str, path: Path, meshes: Sequence[Path] = ()) -> str:
         keys = ("fe", "efg", "integration_points", "surface_areas")
         scene["mesh"] = {key: f"{mesh.parent.name}/{mesh.name}" for key, mesh in zip(keys, meshes, strict=True)}
     lines = [
-        f"# A first scene of mpitled ({kind}). A key behind # has its default: remove the # to change it.",
-        f"# 'mpitled check {path.name}' shows what is in it, 'mpitled run {path.name}' computes it.",
+        f"# A first scene of mpitled ({kind}). A key after # has its default value: remove the # to change it.",
+        f"# 'mpitled check {path.name}' lists its contents, 'mpitled run {path.name}' computes it.",
         *_keys("", {"title": f"A scene of kind {kind}"}),
     ]
     for home in deck.homes()[1:]:
@@ -88,7 +88,7 @@ def text(kind: str, path: Path, meshes: Sequence[Path] = ()) -> str:
 
 
 def _keys(section: str, values: dict[str, Any]) -> Iterator[str]:
-    """Every key of a section with its meaning; as a comment if its value is not given."""
+    """Every key of a section with its meaning. A key without a given value is a comment."""
     for name, key in deck.keys_of(section).items():
         yield f"# {key['description']}; {deck.expected(key)}"
         default = toml.value(key["default"]) if "default" in key else ""
@@ -96,7 +96,7 @@ def _keys(section: str, values: dict[str, Any]) -> Iterator[str]:
 
 
 def _write_meshes(folder: Path) -> list[Path]:
-    """The meshes of a small block with a cloud, in place of a user's own."""
+    """Write the meshes of a small block with a cloud, which the user replaces by real meshes."""
     from mpitled import export, store
     from mpitled.model import build as model_build
 

@@ -1,4 +1,4 @@
-"""Decks: every mistake gets one line with key, value and remedy; values are SI and can be read again."""
+"""Decks: each mistake gets one line with key, value and remedy; values are SI and can be read again."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ HEAD = {"labels": {"image": "head.nii.gz"}, "material": BLOCK["material"]}
 
 
 def toml(value, top=True):
-    """A TOML document of plain values; sections below the first level are inline tables, which read as the same."""
+    """A TOML document of plain values, with inline tables below the first level."""
     if isinstance(value, dict):
         pairs = [f"{name} = {toml(inner, False)}" for name, inner in value.items()]
         return "\n".join(pairs) + "\n" if top else f"{{{', '.join(pairs)}}}"
@@ -59,16 +59,16 @@ def write(folder, content):
 
 
 def changed(content, name, value):
-    """The deck with the key `name` ("fixed.0.nodes") set, or taken out if the value is None."""
+    """The deck with another value of the key `name` ("fixed.0.nodes"); without the key if the value is None."""
     content = copy.deepcopy(content)
-    *way, last = (int(step) if step.isdecimal() else step for step in name.split("."))
-    place = content
-    for step in way:
-        place = place[step] if isinstance(step, int) else place.setdefault(step, {})
+    *parts, last = (int(part) if part.isdecimal() else part for part in name.split("."))
+    table = content
+    for part in parts:
+        table = table[part] if isinstance(part, int) else table.setdefault(part, {})
     if value is None:
-        del place[last]
+        del table[last]
     else:
-        place[last] = value
+        table[last] = value
     return content
 
 
@@ -83,18 +83,16 @@ def complaint(path, *overrides):
 # ------------------------------------------------------------ one wrong key
 
 
-#: Deck, key, wrong value, and words that the message must have: what is wrong, what to give, the nearest key or choice.
+#: Deck, key, wrong value, and a part of the message: the error, the remedy, the nearest key or choice.
 WRONG = [
     # impossible values
     (BLOCK, "material.brain.poissons_ratio", 0.5, "not less than 0.5; give a number above -1 and below 0.5"),
-    (BLOCK, "material.brain.youngs_modulus", math.inf, "give a number above 0, in Pa"),
     (BLOCK, "material.brain.youngs_modulus", math.nan, "give a number above 0, in Pa"),
     (BLOCK, "material.brain.youngs_modulus", 1e31, "not a number up to 1e30; give a number above 0, in Pa"),
     (BLOCK, "material.brain.youngs_modulus", 10**400, "give a number above 0, in Pa"),
     (BLOCK, "material.brain.youngs_modulus", 1e-31, "not greater than 0"),
     (BLOCK, "material.brain.density", -1.0, "a number above 0, in kg/m3 (default 1000.0)"),
     (BLOCK, "block.size", [30.0, 0.0, 24.0], "entry 2 is not greater than 0; give a list of 3 numbers above 0, in mm"),
-    (BLOCK, "block.corner", [30.0, -math.inf, 0], "entry 2 is not a number up to 1e30; give a list of 3 numbers"),
     (BLOCK, "block.elements", [10, 8, 0], "entry 3 is not greater than or equal to 1; give a list of 3 integers"),
     (BLOCK, "block.elements", [10, 8, 2**40], "entry 3 is not less than"),
     (BLOCK, "block.fitted", "cyst", "is none of the spheres (there are none); add [sphere.cyst]"),
@@ -104,36 +102,26 @@ WRONG = [
     (FULL, "solver.time_step", 0.0, 'give "auto" or a number above 0, in s (default "auto")'),
     (FULL, "solver.time_step", 2.5, "is longer than solver.load_time; give less than 2 s"),
     (FULL, "displaced.0.displacement", [6.0], "one number for each of"),
-    (FULL, "displaced.0.displacement", [], "wrong number of entries; give a list of numbers, in mm"),
     (FULL, "displaced.0.rotation", 361, "a number at least -360 and at most 360, in degrees (default 0.0)"),
     (HEAD, "labels.image", "", "give a path relative to the deck's folder"),
     (HEAD, "labels.left_ventricle", [1], "1 is in labels.tissue already; name a label once"),
-    # wrong types: nothing is converted
+    # wrong types, which are not converted
     (BLOCK, "block.size", 30.0, "is not a list; give a list of 3 numbers above 0, in mm"),
     (BLOCK, "block.size", [30.0, "24", 24.0], "entry 2 is not a valid number"),
-    (BLOCK, "block.elements", [10, 8.0, 8], "entry 2 is not a valid integer; give a list of 3 integers"),
     (BLOCK, "material.brain.youngs_modulus", "3000", "is not a valid number; give a number"),
-    (BLOCK, "material.brain.youngs_modulus", {"value": 3000.0}, "is not a valid number; give a number"),
     (BLOCK, "material.brain.youngs_modulus", True, "is not a valid number; give a number"),
     (BLOCK, "material.brain.cells", [], "wrong number of entries"),
     (BLOCK, "material.brain.cells", ["all", "all"], "has an entry twice"),
     (BLOCK, "material.brain.law", "neo-hooke", "is not offered; did you mean neo-hookean?"),
-    (BLOCK, "material.brain.law", {}, "is not offered"),
     (BLOCK, "support.consistency", 1, "give true or false (default true)"),
     (BLOCK, "support.weight", "quartik", 'did you mean quartic?; give "equal" or "quartic" (default "quartic")'),
-    (BLOCK, "title", 3, "give a string"),
-    (FULL, "fixed.0.directions", ["x", "w"], "entry 2 is not offered"),
-    # sections that are none, and keys out of place
+    # values instead of sections
     (BLOCK, "support", 8, "is not a section; write [support] above its keys"),
-    (BLOCK, "material", 3000.0, "is not a section; write [material.NAME] above its keys"),
     (BLOCK, "material.poissons_ratio", 0.49, "is not a section; write [material.NAME] above its keys"),
     (BLOCK, "fixed", {"nodes": "x0"}, "is not a section; write [[fixed]] above its keys"),
-    # unknown names, with the nearest that there is
+    # unknown names, with the nearest known name
     (BLOCK, "blok", {"size": [1.0, 1.0, 1.0]}, "unknown section or key; did you mean block?"),
-    (BLOCK, "path", "x", "unknown section or key; there are title, labels"),
-    (BLOCK, "material.brain.name", "x", "unknown key; there are law, density, cells, youngs_modulus"),
     (BLOCK, "material.brain.young_modulus", 3000.0, "unknown key; did you mean youngs_modulus?"),
-    (FULL, "fixed.0.node", "x1", "unknown key; did you mean nodes?"),
     (BLOCK, "block.density", 1000.0, "unknown key; density belongs to [material.NAME]"),
     (BLOCK, "poissons_ratio", 0.49, 'poissons_ratio belongs to [material.NAME] law = "neo-hookean"'),
 ]
@@ -178,7 +166,7 @@ def test_a_wrong_value_gets_one_line_with_key_value_and_remedy(folder, content, 
         (HEAD, "labels.image", None, "labels.image: is missing; give a path"),
     ],
 )  # fmt: skip
-def test_keys_that_are_missing_or_clash(folder, content, name, value, words):
+def test_missing_and_contradictory_keys(folder, content, name, value, words):
     path = write(folder, changed(content, name, value))
     message = complaint(path)
     assert message.startswith(f"{path}: ")
@@ -257,7 +245,7 @@ def test_overrides_that_cannot_be_read(folder, text, words):
     assert words in message
 
 
-def test_an_override_is_to_blame_for_what_is_in_it_or_around_it(folder):
+def test_messages_name_the_override_that_causes_an_error(folder):
     path = write(folder, FULL)
     for text, name in (
         ("block.size.1=-24.0", "block.size"),
@@ -269,7 +257,7 @@ def test_an_override_is_to_blame_for_what_is_in_it_or_around_it(folder):
     message = complaint(path, "tumour.centre=1,2, 3")
     assert message.startswith('--set: tumour.centre = "1,2, 3": is not a list; give a list of 3 numbers, in mm')
     assert message.endswith("'tumour.centre=[1, 2, 3]'")
-    # The file is to blame for a wrong value of its own.
+    # The file is the cause of a wrong value in the file.
     path = write(folder, changed(BLOCK, "block.elements", [10, 8, 0]))
     assert complaint(path, "block.size.1=24.0").startswith(f"{path}: block.elements")
 
@@ -284,7 +272,7 @@ def test_overrides_change_the_deck(folder):
             "block.size.1=25",
             "fixed.1.nodes=z0",
             'displaced.0={nodes = "x1", displacement = [1], directions = ["x"]}',
-            "output.frames=2",  # of a section that the file does not have
+            "output.frames=2",  # of a section that is not in the file
             "output.frames=3",  # the last one counts
         ],
         ["solver.time_step=1e-4"],
@@ -355,7 +343,7 @@ def test_a_canonical_deck_reads_as_the_same_deck(tmp_path_factory, size, moved, 
     deck = load_deck(write(folder, content))
     assert deck.block.size == tuple(edge / 1e3 for edge in size)
     written = canonical(deck)
-    # The report shows what the user wrote in at most 15 digits.
+    # The report shows the digits of the deck if they are at most 15.
     for given_edge, edge in zip(size, written["block"]["size"], strict=True):
         assert edge == given_edge or float(f"{given_edge:.15g}") != given_edge
     for again in (written, json.loads(json.dumps(written))):
@@ -367,11 +355,11 @@ def test_a_canonical_deck_reads_as_the_same_deck(tmp_path_factory, size, moved, 
 
 # ------------------------------------------------------------ the model's key
 
-#: Values for keys that hold a word: the first that the deck takes in place of its own.
+#: Values for keys with a word: the first that the deck accepts replaces the word.
 WORDS = ["recover", "single", "quartic", "equal", "quasi-static", "centre", "all", "mm", "x", "dynamic", "other"]
 
 
-def others(value):
+def alternatives(value):
     if isinstance(value, bool):
         return [not value]
     if isinstance(value, int):
@@ -380,15 +368,15 @@ def others(value):
         return [value * 0.999 + 1e-3]
     if isinstance(value, str):
         return [word for word in WORDS if word != value] + [1e-3, 3]
-    return [[other, *value[1:]] for other in others(value[0])] + [value[:-1], value[::-1]]
+    return [[other, *value[1:]] for other in alternatives(value[0])] + [value[:-1], value[::-1]]
 
 
-def test_the_models_key_changes_exactly_with_what_the_model_depends_on(folder):
+def test_the_models_key_changes_exactly_with_the_input_of_the_model(folder):
     path = write(folder, FULL)
     content, key = canonical(load_deck(path)), model_key(load_deck(path))
     seen, unchangeable = {key}, []
     for name, value in flat(content):
-        for other in others(value):
+        for other in alternatives(value):
             try:
                 deck = load_deck(write(folder, changed(content, name, other)))
             except InputError:
@@ -405,7 +393,7 @@ def test_the_models_key_changes_exactly_with_what_the_model_depends_on(folder):
     assert unchangeable == ["material.brain.law"]  # another law has other parameters
 
 
-def test_the_models_key_follows_the_contents_of_files_and_not_their_names(folder):
+def test_the_models_key_depends_on_contents_and_not_names_of_files(folder):
     path = write(folder, HEAD)
     key = model_key(load_deck(path))
     (folder / "deeper").mkdir()
@@ -431,7 +419,7 @@ def test_shipped_decks_load_and_fit_the_json_schema(path):
     validator.validate(canonical(deck))
 
 
-def test_the_json_schema_refuses_what_a_single_key_refuses():
+def test_the_json_schema_refuses_wrong_values_of_single_keys():
     schema = json_schema()
     jsonschema.Draft7Validator.check_schema(schema)
     assert schema["definitions"]["Block"]["properties"]["size"]["description"] == "edges along x, y, z, in mm"
@@ -443,7 +431,7 @@ def test_the_json_schema_refuses_what_a_single_key_refuses():
             assert value == 1e-31 or not validator.is_valid(changed(content, name, value)), name
 
 
-def test_the_table_and_the_completions_have_every_key_and_the_defaults_that_take_effect(folder):
+def test_table_and_completions_have_every_key_and_its_default(folder):
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in markdown_table().splitlines()]
     assert all(len(row) == 5 and row[4] for row in rows[2:])
     defaults, home = {}, ""

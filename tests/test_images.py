@@ -92,7 +92,7 @@ def test_files_lie_on_the_image_and_say_what_they_are(run):
     names = ("displacement.nii.gz", "inverse_displacement.nii.gz", "labels.nii.gz")
     assert paths == [str(run.folder / "export" / name) for name in names]
     assert label == "label 42 of labels.nii.gz is the tumour"
-    assert told.startswith("inverse_displacement.nii.gz leads back to within 0.")
+    assert told.startswith("inverse_displacement.nii.gz inverts the displacements to within 0.")
     for path in paths:
         written = nibabel.load(path)
         np.testing.assert_array_equal(written.affine, image.affine)
@@ -122,7 +122,7 @@ def test_displacement_is_the_field_at_the_voxels_of_tissue(run):
 
 
 def test_the_inverse_leads_back_to_where_the_tissue_was(run):
-    (told,) = (float(line.split()[-6]) for line in run.said if "leads back" in line)
+    (told,) = (float(line.split()[-6]) for line in run.said if "inverts the displacements" in line)
     tumour = np.linalg.norm(run.places - CENTRE, axis=3) < 6
     covered = (run.before > 0) & ~tumour  # which the skull does not let go
     assert not run.back[~covered].any()
@@ -277,7 +277,7 @@ def test_an_undeformed_body_is_where_it_was(run):
 def test_of_an_unfinished_run_the_last_frame_is_written(run, tmp_path, monkeypatch):
     monkeypatch.setattr(results.Result, "complete", False)
     done = mpitled("export", run.folder, "--nifti", "--out", tmp_path)
-    note = f"note: {run.folder}: is not complete; the images are of its last frame, at 100.0% of the load\n"
+    note = f"note: {run.folder}: is not complete; the images show its last frame, at 100.0% of the load\n"
     assert done.stderr == note
 
 

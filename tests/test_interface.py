@@ -124,7 +124,7 @@ def test_what_other_libraries_take(result):
             assert np.nanmax(grid.cell_data["stress"]) == opened.stress[-1].max()
             assert np.array_equal(np.isnan(grid.cell_data["J"]), grid.cell_data["kind"] == 1)  # EFG nodes
             assert np.count_nonzero(grid.cell_data["kind"] == 2) == len(store.read_model(out / "model.h5").domains)
-            with pytest.raises(IndexError, match="and no 99"):
+            with pytest.raises(IndexError, match="but no frame 99"):
                 opened.to_pyvista(99)
         assert repr(opened) == f"<RunResult {opened.path}: {len(opened.times)} frames>"
         if importlib.util.find_spec("pandas"):

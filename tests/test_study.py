@@ -1,4 +1,4 @@
-"""Studies: every run once, errors against a reference, the best marked, and what fails said."""
+"""Studies: every run once, errors against a reference, Pareto optima, and failures."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def rows(out):
         return list(csv.DictReader(file))
 
 
-def test_a_study_goes_on_where_it_stopped_and_tells_errors_and_failures(tmp_path):
-    """The cube's compression is homogeneous: any mesh has it to the tolerance that relaxation is given."""
+def test_a_study_resumes_and_has_errors_and_failures(tmp_path):
+    """The compression is homogeneous: every mesh has the exact solution within the tolerance of relaxation."""
     out = tmp_path / "study"
     arguments = [
         "study", CUBE, "--out", out, "--reference", REFERENCE, "--set", "solver.method=dynamic-relaxation",
@@ -62,14 +62,14 @@ def test_a_study_goes_on_where_it_stopped_and_tells_errors_and_failures(tmp_path
     assert "1/6: " not in again.stderr
     assert again.stderr.count("/6: solver.tolerance 0.1\n") == 1
     assert removed.exists()
-    told = json.loads(again.stdout)
-    assert [row["max_error_mm"] is None for row in told] == [row["max_error_mm"] == "" for row in table]
+    records = json.loads(again.stdout)
+    assert [row["max_error_mm"] is None for row in records] == [row["max_error_mm"] == "" for row in table]
     quiet = mpitled(*arguments, "-q")
     assert (quiet.stdout, quiet.stderr) == ("", "")
 
 
 def test_names_in_the_picture_do_not_overlap(tmp_path):
-    """Of the kept study, half of whose runs are in one place."""
+    """In the study of jobs/studies, half of the runs are close to each other."""
     with (ROOT / "jobs" / "studies" / "tumour.csv").open(newline="") as file:
         table = list(csv.DictReader(file))
     for row in table:
@@ -87,8 +87,8 @@ def test_names_in_the_picture_do_not_overlap(tmp_path):
         assert axes.bbox.y0 < box.y0 < box.y1 < axes.bbox.y1
 
 
-def test_without_a_reference_runs_are_compared_with_the_one_of_most_work(tmp_path):
-    """Each of these ends within 0.01 mm of its own rest, which says nothing of its cloud."""
+def test_without_a_reference_runs_are_compared_with_the_run_of_most_work(tmp_path):
+    """Each run ends within 0.01 mm of rest, although the coarse cloud has a larger error."""
     deck, out = tmp_path / "scene.toml", tmp_path / "study"
     deck.write_text(TUMOUR)
     keys = ["solver.method=dynamic-relaxation", "output.pictures=false"]
@@ -98,8 +98,8 @@ def test_without_a_reference_runs_are_compared_with_the_one_of_most_work(tmp_pat
     (finest,) = [row for row in table if row["is_reference"]]
     assert finest["value"] == "0.3"
     assert finest["max_error_mm"] == ""
-    own, coarse, _ = table
-    assert 0.05 < float(own["max_error_mm"]) < float(coarse["max_error_mm"])
+    unvaried, coarse, _ = table
+    assert 0.05 < float(unvaried["max_error_mm"]) < float(coarse["max_error_mm"])
     assert "difference" in done.stdout
     assert "reference" in done.stdout
     report = json.loads(next(out.glob("cloud.growth-1.0-*/report.json")).read_text())
@@ -112,7 +112,7 @@ def test_without_a_reference_runs_are_compared_with_the_one_of_most_work(tmp_pat
     assert "reference" in alone.stdout
 
 
-def test_what_cannot_be_varied_is_said_before_anything_runs(tmp_path):
+def test_bad_values_end_a_study_before_its_first_run(tmp_path):
     for vary, word in (
         ("solver.load_step=1,2", "solver.load_step"),
         ("solver.tolerance", "key=value"),

@@ -1,4 +1,4 @@
-"""Records of decks: every value that took effect, differences between two records, and keys of models and scenes."""
+"""Records of decks: all effective values, differences between two records, and keys of models and scenes."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ COSMETIC_KEYS = ("title", "output.pictures", "output.checkpoint_minutes")
 
 
 def canonical(deck: Deck, *, paths: bool = True) -> dict[str, Any]:
-    """Every value that took effect, defaults too, in the deck's layout and units; ready for JSON or TOML.
+    """All effective values, including defaults, in the deck's layout and units, for JSON or TOML.
 
-    Without `paths`, file names are left out: a file may have been moved and still be the same.
+    Without `paths`, file names are omitted, because a file may have been moved without a change.
     """
     return _table(deck, str if paths else lambda _: None)
 
 
 def _table(deck: Deck, name_of: Callable[[Path], str | None]) -> dict[str, Any]:
-    """The `canonical` table with `name_of` each file; None leaves the key out."""
+    """The `canonical` table with the result of `name_of` for each file; the key is omitted if it is None."""
     table: dict[str, Any] = _plain(deck, name_of)
     return {name: value for name, value in table.items() if value not in ([], {})}
 
@@ -50,13 +50,13 @@ def _plain(value: Any, name_of: Callable[[Path], str | None], unit: str = "") ->
 
 
 def recorded(table: Mapping[str, Any], path: Path) -> Deck:
-    """The deck of a `canonical` table without its geometry and motion: their files may no longer exist."""
+    """The deck of a `canonical` table without geometry and prescribed nodes. Their files may not exist any more."""
     removed = (*GEOMETRIES, "fixed", "displaced")
     return Deck.from_table({name: section for name, section in table.items() if name not in removed}, path)
 
 
 def difference(deck: Deck, earlier: dict[str, Any]) -> str:
-    """The first key that affects the result and differs from an earlier `canonical` table without paths; "" if none."""
+    """The first difference that affects the result from an earlier `canonical` table without paths; "" if none."""
     for name, *values in differences(canonical(deck, paths=False), earlier):
         after, before = ("absent" if value is None else shown(value) for value in values)
         return f"{name} = {before}, and not {after}"
@@ -64,7 +64,7 @@ def difference(deck: Deck, earlier: dict[str, Any]) -> str:
 
 
 def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Keys that affect the result and differ between two `canonical` tables, with both values; None: absent."""
+    """Keys that affect the result and differ between two `canonical` tables, with both values. None: absent."""
     first, second = dict(flat(one)), dict(flat(other))
     for name in dict.fromkeys([*second, *first]):
         if name not in COSMETIC_KEYS and first.get(name) != second.get(name):
@@ -84,12 +84,12 @@ def flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def changes_physics(name: str) -> bool:
-    """Whether a key defines the problem and not its numerical solution: geometry, tumour, materials and motion."""
+    """Whether a key defines the problem (geometry, tumour, materials, prescribed nodes), not its numerical solution."""
     return name.partition(".")[0] in _PHYSICS
 
 
 def model_key(deck: Deck, included: Sequence[Path] = ()) -> str:
-    """What determines the model, as JSON: this program, the deck's values, and files by their SHA-256.
+    """The input of the model as JSON: this program, the deck's values, and files by their SHA-256.
 
     `included` are files that the files of the deck include.
     """
@@ -98,7 +98,7 @@ def model_key(deck: Deck, included: Sequence[Path] = ()) -> str:
 
 
 def scene_key(deck: Deck, included: Sequence[Path] = ()) -> str:
-    """What determines the result, whatever the program: all sections, like `model_key`."""
+    """The input of the result as JSON, without the program: all sections, in the form of `model_key`."""
     table = _table(deck, _digest)
     del table["title"], table["output"]["checkpoint_minutes"]
     return _content(table, included)

@@ -1,7 +1,7 @@
-"""The sections and keys of a deck: one declaration for each key gives its type, unit, default, limits and meaning.
+"""The sections and keys of a deck. One declaration of each key gives its type, unit, default, limits and meaning.
 
-A deck is in mm, degrees and SI units. The attributes of the sections are in SI units. A section that Python code makes
-directly, such as `Cloud(radius=0.018)`, takes SI units; only a deck that is loaded is converted.
+Values of a deck are in mm, degrees and SI units; attributes of the sections are in SI units. Values in Python code,
+such as `Cloud(radius=0.018)`, are in SI units too: only the values of a loaded deck are converted.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from pydantic_core import PydanticCustomError
 from mpitled.laws import LAWS, Law, Material, NeoHookean
 from mpitled.mesh import METRES, Constraint, Rotation
 
-#: Units of the deck that are not SI: how many make one SI unit. Dividing by a power of ten rounds 5.1 mm to 0.0051 m.
+#: Number of the deck's units in one SI unit. The division by a power of ten rounds 5.1 mm to 0.0051 m.
 _PER_SI = {"mm": 1e3, "mm3": 1e9, "degrees": 180 / math.pi}
-#: Larger numbers are mistakes, and smaller ones are zero: ratios of the others and their cubes are finite.
+#: Larger numbers are mistakes, and numbers below its inverse are zero, so that ratios and cubes of numbers are finite.
 _LARGEST = 1e30
-#: The law of a material that names none.
+#: The law of a material without the key `law`.
 DEFAULT_LAW = NeoHookean.name
 #: The sections of which a deck has exactly one.
 GEOMETRIES = ("labels", "block", "cylinder", "ellipsoid", "mesh")
@@ -46,7 +46,7 @@ def from_si(value: Any, unit: str) -> Any:
 
 
 def _strict(value: Any) -> Any:
-    """A value of TOML with tuples in place of lists, and floats in the range of sizes and moduli."""
+    """A TOML value with tuples instead of lists; tiny floats become 0, huge numbers infinite."""
     if isinstance(value, dict):
         return {name: _strict(inner) for name, inner in value.items()}
     if isinstance(value, list):
@@ -57,7 +57,7 @@ def _strict(value: Any) -> Any:
 
 
 def key(meaning: str, default: Any = ..., unit: str = "", **limits: Any) -> Any:
-    """A key of a section. `default` and `limits`, as in pydantic, are in the deck's `unit`; no default: required."""
+    """A key of a section. `default` and `limits` (of pydantic) are in the deck's `unit`. Without default: required."""
     extra = {"unit": unit} | ({} if default in (..., None) else {"default": default})
     return Field(to_si(default, unit), description=meaning, json_schema_extra=extra, **limits)
 
@@ -108,7 +108,7 @@ _XYZ = ("x", "y", "z")
 
 
 class Section(BaseModel):
-    """A section of a deck: immutable, strict about types, without unknown keys."""
+    """A section of a deck: immutable, without conversion of types and without unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_by_name=True)
 
@@ -252,13 +252,13 @@ class MaterialSection(Section):
     @model_validator(mode="before")
     @classmethod
     def _make_law(cls, table: Any, info: ValidationInfo) -> Any:
-        """The table of a deck with a law in place of its name and its parameters."""
+        """The table of a deck with a law instead of the law's name and parameters."""
         if info.context is None or not isinstance(table, dict):
             return table
         common = {field.validation_alias or name for name, field in cls.model_fields.items()}
-        own = {name: value for name, value in table.items() if name in common}
+        keys = {name: value for name, value in table.items() if name in common}
         law = LAWS.get(str(table.get("law", DEFAULT_LAW)))
-        return own | ({"law": law.model_validate({k: v for k, v in table.items() if k not in common})} if law else {})
+        return keys | ({"law": law.model_validate({k: v for k, v in table.items() if k not in common})} if law else {})
 
     @property
     def material(self) -> Material:
@@ -321,7 +321,7 @@ class Partition(Section):
 
 
 class Deck(Section):
-    """A scene in SI units. It has exactly one of the geometries."""
+    """A scene in SI units, with exactly one geometry."""
 
     title: str = key("what the scene is, in a few words", "")
     labels: Labels | None = None
@@ -354,20 +354,18 @@ class Deck(Section):
 
     @classmethod
     def from_table(cls, table: dict[str, Any], path: Path) -> Deck:
-        """The deck of a table as TOML has it; pydantic's ValidationError if it is wrong."""
+        """The deck of a TOML table. pydantic's ValidationError if the table is wrong."""
         return cls.model_validate(_strict(table) | {"[path]": path}, context=path.parent, by_alias=True, by_name=False)
 
     def constraints(self) -> Iterator[Constraint]:
-        """The held and the moved nodes, with the key that says so."""
-        for i, held in enumerate(self.fixed):
-            yield Constraint(held.nodes, _axes(held), (0.0,) * len(held.directions), f"{self.path}: fixed.{i}.nodes")
-        for i, moved in enumerate(self.displaced):
-            axes, origin = _axes(moved), f"{self.path}: displaced.{i}.nodes"
-            rotation = Rotation(moved.rotation, "xyz".index(moved.axis), moved.centre) if moved.rotation else None
-            displacement = moved.displacement or (0.0,) * len(axes)
-            yield Constraint(
-                moved.nodes, axes, displacement, origin, rotation, moved.field, METRES[moved.field_unit or "mm"]
-            )
+        """The fixed and the displaced nodes, each with the key that prescribes them."""
+        for i, fixed in enumerate(self.fixed):
+            yield Constraint(fixed.nodes, _axes(fixed), (0.0,) * len(fixed.directions), f"{self.path}: fixed.{i}.nodes")
+        for i, s in enumerate(self.displaced):
+            axes, origin, unit = _axes(s), f"{self.path}: displaced.{i}.nodes", METRES[s.field_unit or "mm"]
+            rotation = Rotation(s.rotation, "xyz".index(s.axis), s.centre) if s.rotation else None
+            displacement = s.displacement or (0.0,) * len(axes)
+            yield Constraint(s.nodes, axes, displacement, origin, rotation, s.field, unit)
 
 
 def _axes(section: Fixed | Displaced) -> tuple[int, ...]:

@@ -1,1 +1,1 @@
-"""What a run will do, before it does: what a deck holds, its steps, time and memory."""
+"""Before a run: the contents of a deck, and the steps, time and memory of its run."""

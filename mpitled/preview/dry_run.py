@@ -1,4 +1,4 @@
-"""`run --dry`: the time that a run would take, its terms, kernels and arrays, and what it omits; no step is taken."""
+"""`run --dry`: the expected time of a run, its terms, kernels and arrays, and the omitted terms, without a step."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from mpitled.terms.term import Method
 
 
 def dry_run(deck: Deck, directory: Path, world: World, *, verbose: bool = False) -> str:
-    """Build the model, its partition and the terms as the run does, and describe them; the same text on all ranks.
+    """Build the model, its partition and the terms of a run, and return their description, the same on all ranks.
 
-    Every kernel is called a few times on the undeformed body to measure its time. `verbose` gives the shape and type
-    of every array. Collective.
+    The time of every kernel is measured in a few calls on the undeformed body. verbose: also the shape and type of
+    every array. Collective.
     """
     run = job.prepare(deck, directory, world)
     run.warm_up()
@@ -36,7 +36,7 @@ def dry_run(deck: Deck, directory: Path, world: World, *, verbose: bool = False)
     check_calls = trace_kernels([("stability check", integrator.check)])
     seconds, check = forecast.measure(integrator)
     step = sum(seconds.values())
-    run.output.keep_stable(integrator, {})  # allocates what a run holds
+    run.output.keep_stable(integrator, {})  # allocates the arrays of a run
     kinds = [sub.rows.n_own("hexahedra"), sub.rows.n_own("support domains")]
     counts = [*kinds, sub.n_nodes, sum(len(nodes) for _, nodes in sub.shared)]
     sizes = [distinct_bytes(calls) / sub.n_cells, _reachable_bytes(integrator, run.output) / sub.n_cells]
@@ -50,15 +50,15 @@ def dry_run(deck: Deck, directory: Path, world: World, *, verbose: bool = False)
         numbers = [f"{value:{width}.0f}" for value, width in zip(row, (11, 9, 9, 8, 20, 20), strict=False)]
         lines.append(f"{rank:4}{''.join(numbers)}{row[-2]:10.3f}{row[-1]:11.3f}")
     lines.append("each step, on rank 0:")
-    for name, of_term in seconds.items():
-        lines.append(f"  {name}, {1e3 * of_term:.3f} ms")
+    for name, value in seconds.items():
+        lines.append(f"  {name}, {1e3 * value:.3f} ms")
         lines += _kernels([call for call in calls if call.term == name], verbose)
     lines.append("each stability check, on rank 0:")
     if not verbose:
         known = {call.kernel for call in calls}
-        again = Counter(call.kernel for call in check_calls if call.kernel in known)
+        repeated = Counter(call.kernel for call in check_calls if call.kernel in known)
         check_calls = [call for call in check_calls if call.kernel not in known]
-        lines += [f"    as in a step: {', '.join(f'{k}{_times(n)}' for k, n in again.items())}"] if again else []
+        lines += [f"    as in a step: {', '.join(f'{k}{_times(n)}' for k, n in repeated.items())}"] if repeated else []
     lines += _kernels(check_calls, verbose)
     left_out = [world.broadcast(run.left_out, rank) for rank in range(world.size)]
     lines.append("left out:")
@@ -71,16 +71,16 @@ def dry_run(deck: Deck, directory: Path, world: World, *, verbose: bool = False)
 
 
 def _duration(run: Any, step: float, check: float) -> list[str]:
-    """Number of steps and their time on the slowest rank; step and check in s."""
+    """Number of steps and their time on the slowest rank. step, check: their times, s."""
     integrator = run.integrator
     if integrator.scene.method is not Method.RELAXATION:
         length = f" of {integrator.state.time_step:.4g} s"
-        more = "; the step becomes shorter where cells require it, and longer again"
+        more = "; the step becomes shorter when cells require it, then longer again"
         if integrator.scene.method is Method.QUASI_STATIC:
-            more = "; then a relaxation to rest, which gives the distance to the static solution"
+            more = "; then a relaxation to rest, for the distance to the static solution"
     else:
         length = " of load"
-        more = f"; then as many as come within {1e3 * integrator.tolerance:g} mm of rest, about as many again"
+        more = f"; then, until {1e3 * integrator.tolerance:g} mm from rest, about the same number"
     expected = forecast.expect(integrator, step, check, run.output_bytes)
     least = "at least " if expected.at_least else ""
     return [
@@ -92,18 +92,16 @@ def _duration(run: Any, step: float, check: float) -> list[str]:
 
 
 def _kernels(calls: Sequence[Call], verbose: bool) -> list[str]:
-    """A line for each kernel with the names of its arrays; with `verbose`, for each call that differs, with shapes."""
+    """A line for each kernel with the names of its arrays; with `verbose`, for each distinct call, with shapes."""
     groups: dict[tuple[str, str], list[Call]] = {}
     for call in calls:
         arrays = (f"{name} {'x'.join(map(str, a.shape))} {a.dtype}" for name, a in call.arrays.items())
         groups.setdefault((call.kernel, ", ".join(arrays) if verbose else ""), []).append(call)
     lines = []
-    for (kernel, shapes), of_kernel in groups.items():
-        names = shapes or " ".join(dict.fromkeys(name for call in of_kernel for name in call.arrays))
-        line = f"{kernel}{_times(len(of_kernel))}, {distinct_bytes(of_kernel) / 1e6:.3g} MB: {names}"
-        lines += textwrap.wrap(
-            line, 118, initial_indent=4 * " ", subsequent_indent=6 * " ", break_on_hyphens=False
-        )  # fmt: skip
+    for (kernel, shapes), group in groups.items():
+        names = shapes or " ".join(dict.fromkeys(name for call in group for name in call.arrays))
+        line = f"{kernel}{_times(len(group))}, {distinct_bytes(group) / 1e6:.3g} MB: {names}"
+        lines += textwrap.wrap(line, 118, initial_indent="    ", subsequent_indent="      ", break_on_hyphens=False)
     return lines
 
 
@@ -112,7 +110,7 @@ def _times(n: int) -> str:
 
 
 def _reachable_bytes(*roots: object) -> int:
-    """Bytes of all arrays that objects of this package hold, each array counted once."""
+    """Bytes of all arrays reachable from objects of this package, each array counted once."""
     arrays: dict[int, int] = {}
     seen: set[int] = set()
     todo: list[Any] = list(roots)

@@ -1,4 +1,4 @@
-"""The kernels that each term of a step calls, and the arrays that it passes to them."""
+"""Trace the kernel calls of the terms of a step, with their arrays."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Call:
 
     @property
     def traffic(self) -> int:
-        """Least bytes between memory and core: each array is read once and, if it was changed, written once."""
+        """Minimal bytes between memory and core: each array is read once and, if it was changed, written once."""
         return sum(array.nbytes * (1 + (name in self.written)) for name, array in self.arrays.items())
 
 

@@ -1,4 +1,4 @@
-"""`mpitled check`: the contents of a mesh file or of the mesh of a deck, after all checks; the forecast of a run."""
+"""`mpitled check`: check a mesh file or a deck, describe its mesh, and forecast the run of the deck."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mpitled.preview import forecast
 from mpitled.readers import meshes, solids
 from mpitled.readers.meshfile import MeshFile
 
-#: A tumour closer than this to the plane between left and right is in the middle, m.
+#: A tumour closer than this to the plane between left and right has no side, m.
 _MIDDLE = 0.5e-3
 
 
@@ -33,22 +33,22 @@ class Item(NamedTuple):
 
 
 def check(path: Path, overrides: Sequence[str] = ()) -> str:
-    """Contents and remarks of a mesh file or a deck (TOML), a line each. InputError if it cannot be used."""
+    """Contents and remarks of a mesh file or a deck (TOML), one line each. InputError for a file that a run refuses."""
     return "\n".join(f"{item.name:16} {item.text}" if item.name else item.text for item in _items(path, overrides))
 
 
 def figures(path: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
-    """Contents and remarks of a mesh file or a deck (TOML), for JSON. InputError if it cannot be used."""
-    found: dict[str, Any] = {"remarks": []}
+    """Contents and remarks for JSON; arguments and errors as `check`."""
+    items: dict[str, Any] = {"remarks": []}
     for name, _, value in _items(path, overrides):
         key = name.replace(" ", "_") or "remarks"
         if isinstance(value, dict):
-            found.setdefault(key, {}).update(value)
+            items.setdefault(key, {}).update(value)
         elif key in ("remarks", "fixed", "displaced"):
-            found.setdefault(key, []).append(value)
+            items.setdefault(key, []).append(value)
         else:
-            found[key] = value
-    return found
+            items[key] = value
+    return items
 
 
 def _items(path: Path, overrides: Sequence[str]) -> Iterator[Item]:
@@ -91,7 +91,7 @@ def _deck(deck: Deck) -> Iterator[Item]:
 
 
 def _tumour(tumour: Tumour, mesh: Mesh, *, x_is_right: bool) -> Item:
-    """Place and growth of the tumour, and the distances of its centre from the nodes of nearby structures."""
+    """Position and growth of the tumour, and distances of its centre from the nodes of nearby structures."""
     centre, radius = np.asarray(tumour.centre), sphere_radius(tumour.volume)
     n = len(mesh.hexahedra)
     structures = {}
@@ -132,7 +132,7 @@ def _tumour(tumour: Tumour, mesh: Mesh, *, x_is_right: bool) -> Item:
 
 
 def _file(file: MeshFile) -> Iterator[Item]:
-    """A mesh file by itself, in its own units."""
+    """The contents of a mesh file, in the units of the file."""
     remarks = list(_file_checks(file))
     yield Item("format", str(file.format), str(file.format))
     yield Item("nodes", f"{len(file.points)}", len(file.points))
@@ -159,7 +159,7 @@ def _remarks(texts: Iterable[str]) -> Iterator[Item]:
 
 
 def _file_checks(file: MeshFile) -> Iterator[str]:
-    """Remarks on a file as an FE mesh if all of its solids are hexahedra, else as a cloud."""
+    """Remarks on a file: as an FE mesh if all of its solids are hexahedra, otherwise as a cloud."""
     kinds = {block.kind for block in file.cells if len(block.ids)}
     if "hexahedron" in kinds and not kinds & {"tetrahedron", "wedge", "pyramid"}:
         section = MeshFiles(fe=file.path)
@@ -179,7 +179,7 @@ def _file_checks(file: MeshFile) -> Iterator[str]:
             has, more = "more than hexahedra", ", and mesh.fe if mesh.dropped names the rest"
         yield f"warning: {file.path}: has {has}; it may be mesh.efg{more}"
     if not file.constraints:
-        yield f"warning: {file.path}: fixes and displaces nothing; the deck has to do so"
+        yield f"warning: {file.path}: fixes and displaces no nodes; the deck has to prescribe some"
 
 
 def _extent(points: NDArray[np.float64], scale: float, unit: str) -> Item:
