@@ -181,7 +181,7 @@ def _run(options: _Options) -> None:
     if options.json or not options.quiet:
         from mpitled.results import report
 
-        _print(made, partial(report.table, whole=options.verbose), options)
+        _print(made, partial(report.table, full=options.verbose), options)
         if not options.json:
             print(f"written to {folder}; mpitled report {folder} --html makes a page of it")
 
@@ -405,11 +405,11 @@ def _report(options: _Options) -> int:
     if options.html:
         from mpitled.results import page
 
-        report.keep(options.directory, made.as_json())
+        report.save(options.directory, made.as_json())
         print(f"written to {page.write(options.directory, made)}", file=sys.stderr)
         return 0
     try:
-        report.keep(options.directory, made.as_json())
+        report.save(options.directory, made.as_json())
     except InputError as error:
         _note(error)
     return 0
