@@ -181,7 +181,7 @@ def _run(options: _Options) -> None:
     if options.json or not options.quiet:
         from mpitled.results import report
 
-        _print(figures, partial(report.table, whole=options.verbose), options)
+        _print(figures, partial(report.table, full=options.verbose), options)
         if not options.json:
             print(f"written to {folder}; mpitled report {folder} --html writes a page")
 
@@ -406,7 +406,7 @@ def _report(options: _Options) -> int:
     figures = report.make(options.directory)
     _print(figures.as_json(), report.table, options)
     try:
-        report.keep(options.directory, figures.as_json())
+        report.save(options.directory, figures.as_json())
         if options.html:
             from mpitled.results import page
 

@@ -211,7 +211,7 @@ def test_table_and_vtk_files_are_references(runs, tmp_path):
         ("r.csv", "x,y,z,ux,uy\n", "line 1: has no column uz"),
         ("r.csv", "x,y,z,ux,uy,uz\n0,0,0,1,1,1\n0,0,0,1,1\n", "line 3: has 5 numbers for 6 columns"),
         ("r.csv", "x,y,z,ux,uy,uz\n0,0,0,1,one,1\n", "line 2: could not convert string to float: 'one'"),
-        ("r.csv", "x,y,z,ux,uy,uz\n", "has no places"),
+        ("r.csv", "x,y,z,ux,uy,uz\n", "has no points"),
         ("r.csv", "x,y,z,ux,uy,uz\n0,0,0,1,nan,1\n", "not finite"),
         ("r.csv", "x,y,z,ux,uy,uz,tag\n0,0,0,1,1,1,7\n", "tag has numbers other than 0 to 4"),
         ("r.vtu", "<no/>", "(cannot be read as an unstructured grid|is damaged)"),

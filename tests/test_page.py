@@ -97,7 +97,7 @@ def test_a_page_has_what_the_scene_has(brain, stopped):
     text = (out / report.PAGE).read_text()
     assert "A cylinder &lt;squeezed&gt; &amp; more" in text
     assert re.search(r"not complete: the last frame is at [\d.]+% of the load; unstable at .*worst is", text)
-    assert "There is no picture here: PyVista cannot render on this machine." in text
+    assert "There is no three-dimensional picture: PyVista cannot render on this machine." in text
     assert "gather, add, add_gathered, scatter: one rank" in text
 
 

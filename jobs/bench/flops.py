@@ -91,12 +91,16 @@ def _count(path: Path, stabilisation: float) -> dict[str, float]:
     rows = store.read_part(path, 1, 0)
     # Without the last batch of support domains, which is partly empty.
     full = lambda block: block.n_own // BATCH_LANES * BATCH_LANES if block.kind.meshfree else block.n_own  # noqa: E731
-    rows = replace(rows, blocks=tuple(replace(block, n_own=full(block)) for block in rows.blocks))
+    rows = replace(rows, field_block="", blocks=tuple(replace(block, n_own=full(block)) for block in rows.blocks))
     sub = localise(rows, HOURGLASS, stabilisation, "mean")
     cells = {packed.name: packed.n_cells for packed in sub.packed}
     sub, state = _to_counting(sub), _to_counting(State.at_rest(sub, 1.0, 1e-6))
     counts = {}
     for term in Step(Scene(sub, Solver(method="quasi-static"))).terms:
+        for field in fields(term) if is_dataclass(term) else ():
+            value = getattr(term, field.name)
+            if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+                setattr(term, field.name, np.frompyfunc(Counting, 1, 1)(value))
         before = Counting.operations
         term.apply(state)
         counts[term.name] = (Counting.operations - before) / cells.get(term.name, sub.n_nodes)

@@ -249,7 +249,7 @@ def difference(folder: Path, other: Path) -> str:
     ours, theirs = field.open_field(folder), field.open_field(other)
     reference = compare.read_reference(REFERENCES / "C_tum.npz", ours)
     assert reference.tag is not None
-    places = reference.places[reference.tag == compare.TAGS.index("interior")]
+    places = reference.positions[reference.tag == compare.TAGS.index("interior")]
     apart = np.abs(ours.at(places).displacement - theirs.at(places).displacement).max(axis=0)
     return _three(1e3 * apart)
 
@@ -265,8 +265,8 @@ def profiles(out: Path) -> list[Profile]:
                 if launch.outcome(folder) == "":
                     ours = field.open_field(folder)
                     line = compare.read_reference(REFERENCES / f"{scene.reference}_profile.npz", ours)
-                    runs[kind] = 1e3 * ours.at(line.places).displacement
-            found.append(Profile(scene.title, 1e3 * line.places, 1e3 * line.displacement, runs))
+                    runs[kind] = 1e3 * ours.at(line.positions).displacement
+            found.append(Profile(scene.title, 1e3 * line.positions, 1e3 * line.displacement, runs))
     return found
 
 

@@ -1,1 +1,1 @@
-"""What is made of a result: fields, errors, reports, pictures."""
+"""Results of a run: displacement fields, errors, reports and pictures."""

@@ -1,4 +1,4 @@
-"""Charts of numbers: of one run through time, and of runs compared with one another."""
+"""Charts of the numbers of one run against time, and of several runs against each other."""
 
 from __future__ import annotations
 
@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 _COLOURS = ("#000000", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 _MARKERS = "os^Dv<>P"
 _INK = "#222222"
-_To = Path | BinaryIO
+_Target = Path | BinaryIO
 
-
-#: Positions of a label relative to its point: distances (points), and at each distance these angles (degrees).
+#: Trial positions of a label relative to its point: distances (typographic points) and angles (degrees).
 _DISTANCES = (7, 14, 26, 40, 56, 74)
 _ANGLES = (35, 145, -35, -145, 0, 180, 90, -90, 62, 118, -62, -118)
 
@@ -32,63 +31,62 @@ Label = tuple[float, float, str, str]
 
 
 def _logarithmic(axes: Axes, x: str, y: str) -> None:
-    """Make both axes logarithmic, with these labels, and a grid whose lines all have numbers."""
+    """Make both axes logarithmic, with labels x and y, and a grid with a number at each line."""
     axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
     axes.margins(0.12)
     for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
-        # More powers of ten have fewer lines between them.
-        between = [2.0, 3.0, 5.0, 7.0] if high < 100 * low else [3.0]
-        axis.set_minor_locator(LogLocator(subs=between, numticks=50))
+        multiples = [2.0, 3.0, 5.0, 7.0] if high < 100 * low else [3.0]
+        axis.set_minor_locator(LogLocator(subs=multiples, numticks=50))
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter("{x:g}")
     axes.grid(True, which="both", linewidth=0.3)
 
 
 def _label_points(figure: Figure, axes: Axes, labels: Sequence[Label], size: int = 7) -> None:
-    """Write each label near its point where it covers no point and no label; a line joins distant labels to points.
+    """Write each label near its point without covering other points and labels; a line joins a distant label.
 
-    The figure must be complete apart from these labels, because its layout is fixed here.
+    This function fixes the figure's layout. The figure must be complete apart from these labels.
     """
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
-    around = 4 * figure.dpi / 72
+    radius = 4 * figure.dpi / 72
     points = axes.transData.transform([label[:2] for label in labels])
-    taken = [Bbox.from_extents(*(point - around), *(point + around)) for point in points]
+    occupied = [Bbox.from_extents(*(point - radius), *(point + radius)) for point in points]
     frame = axes.get_window_extent()
     for x, y, text, colour in labels:
-        for far, angle in product(_DISTANCES, np.deg2rad(_ANGLES)) if text else ():
+        for distance, angle in product(_DISTANCES, np.deg2rad(_ANGLES)) if text else ():
             right, up = np.cos(angle), np.sin(angle)
+            line = {"arrowstyle": "-", "color": colour, "linewidth": 0.5} if distance > _DISTANCES[0] else None
             note = axes.annotate(
-                text, (x, y), xytext=(far * right, far * up), textcoords="offset points", fontsize=size, color=colour,
-                ha="center" if abs(right) < 0.5 else "left" if right > 0 else "right",
+                text, (x, y), xytext=(distance * right, distance * up), textcoords="offset points", fontsize=size,
+                color=colour, arrowprops=line, ha="center" if abs(right) < 0.5 else "left" if right > 0 else "right",
                 va="center" if abs(up) < 0.5 else "bottom" if up > 0 else "top",
-                arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.5} if far > _DISTANCES[0] else None,
             )  # fmt: skip
-            note.get_window_extent()  # places the text
+            note.get_window_extent()  # computes the position of the text
             box = Text.get_window_extent(note)
             inside = np.all(box.min > frame.min) and np.all(box.max < frame.max)
-            if inside and not box.count_overlaps(taken):
-                taken.append(box)
+            if inside and not box.count_overlaps(occupied):
+                occupied.append(box)
                 break
             note.remove()
 
 
 def draw_study(rows: list[dict[str, Any]], path: Path, error: str) -> Figure:
-    """Error against loop time of the runs of a study: a line for each family, and a ring around each Pareto optimum."""
+    """Draw error against loop time for the runs of a study: a line for each family, rings around Pareto optima."""
     figure = Figure(figsize=(11, 6.5), layout="constrained")
     axes = figure.add_subplot()
-    done = [row for row in rows if row["max_error_mm"] != ""]
+    finished = [row for row in rows if row["max_error_mm"] != ""]
     labels: list[Label] = []
-    for i, family in enumerate(dict.fromkeys(row["family"] for row in done)):
-        points = [(row["loop_s"], row["max_error_mm"], row["value"]) for row in done if row["family"] == family]
+    for i, family in enumerate(dict.fromkeys(row["family"] for row in finished)):
+        points = [(row["loop_s"], row["max_error_mm"], row["value"]) for row in finished if row["family"] == family]
         colour, marker = _COLOURS[i % len(_COLOURS)], _MARKERS[i % len(_MARKERS)]
         x, y, _ = zip(*points, strict=True)
         axes.plot(x, y, label=family, linewidth=0.8, color=colour, marker=marker)
         labels += [(*point, colour) for point in points]
-    best = sorted((row["loop_s"], row["max_error_mm"]) for row in done if row["pareto"])
+    best = sorted((row["loop_s"], row["max_error_mm"]) for row in finished if row["pareto"])
     axes.plot(
         *zip(*best, strict=True), color=_INK, linestyle="--", linewidth=1, marker="o", markersize=12,
-        markerfacecolor="none", label="none is better in both (Pareto)",
+        markerfacecolor="none", label="Pareto optimum: no run is better in both",
     )  # fmt: skip
     _logarithmic(axes, "time of the loop, s", error)
     figure.legend(fontsize=8, loc="outside right upper", title="varied key; numbers: its values", title_fontsize=8)
@@ -105,53 +103,55 @@ def draw_quantities(
     percentages: Container[str],
     path: Path,
 ) -> None:
-    """Draw each quantity (name: heading) of rows against their number under `key`, a line for each family of rows.
+    """Draw each quantity (name: heading) against the value of `key`, with a line for each family of rows.
 
-    Quantities in `percentages` are shares, drawn in %. Rows with "warnings" have a ring.
+    `label` is that of the horizontal axis. Quantities in `percentages` are shares, drawn in %. Rows with "warnings" get
+    a ring.
     """
-    across = min(4, math.ceil(len(quantities) ** 0.5) + 1)
-    down = math.ceil(len(quantities) / across)
-    figure = Figure(figsize=(3.4 * across, 2.7 * down + 0.5), layout="constrained")
+    n_columns = min(4, math.ceil(len(quantities) ** 0.5) + 1)
+    n_rows = math.ceil(len(quantities) / n_columns)
+    figure = Figure(figsize=(3.4 * n_columns, 2.7 * n_rows + 0.5), layout="constrained")
     warned = [row for rows in families.values() for row in rows if row.get("warnings")]
     for i, (name, heading) in enumerate(quantities.items(), 1):
-        axes = figure.add_subplot(down, across, i, xlabel=label, ylabel=heading)
+        axes = figure.add_subplot(n_rows, n_columns, i, xlabel=label, ylabel=heading)
         for j, (family, rows) in enumerate(families.items()):
             points = sorted((row[key], row[name]) for row in rows if row.get(name, "") != "")
             axes.plot(
-                [x for x, _ in points], [y for _, y in points],
-                label=(family or "here") if len(families) > 1 and points else None, linewidth=1, markersize=4,
-                color=_COLOURS[j % len(_COLOURS)], marker=_MARKERS[j % len(_MARKERS)],
+                *_columns(points), label=(family or "this sweep") if len(families) > 1 and points else None,
+                linewidth=1, markersize=4, color=_COLOURS[j % len(_COLOURS)], marker=_MARKERS[j % len(_MARKERS)],
             )  # fmt: skip
         if warned:
-            ringed = [(row[key], row[name]) for row in warned if row[name] != ""]
             axes.plot(
-                [x for x, _ in ringed], [y for _, y in ringed], label="warned", linestyle="", marker="o",
-                markersize=10, color=_INK, markerfacecolor="none",
+                *_columns([(row[key], row[name]) for row in warned if row[name] != ""]), label="with warnings",
+                linestyle="", marker="o", markersize=10, color=_INK, markerfacecolor="none",
             )  # fmt: skip
         axes.xaxis.set_major_locator(MaxNLocator(5))
         if name in percentages:
             axes.yaxis.set_major_formatter(PercentFormatter(1.0))
             axes.set_ylim(bottom=0.0)
         axes.grid(True, linewidth=0.3)
-    shown = {
-        name: handle for axes in figure.axes for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)
-    }
-    if shown:
-        figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=min(4, len(shown)), fontsize=8)
+    pairs = (pair for axes in figure.axes for pair in zip(*axes.get_legend_handles_labels(), strict=True))
+    if handles := {name: handle for handle, name in pairs}:
+        n_columns = min(4, len(handles))
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=n_columns, fontsize=8)
     figure.savefig(path, dpi=150)
 
 
+def _columns(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
+    return [x for x, _ in points], [y for _, y in points]
+
+
 def draw_cost(points: Sequence[tuple[float, float, str]], path: Path) -> None:
-    """Draw distance from the static solution (mm) against loop time (s) of runs, each with its name."""
+    """Draw distance from the static solution against loop time; `points` are time (s), distance (mm) and name."""
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.add_subplot()
     axes.plot(*zip(*(point[:2] for point in points), strict=True), color=_COLOURS[1], marker="o", linestyle="none")
-    _logarithmic(axes, "time of the loop, s", "from the static solution, by its own estimate, mm")
+    _logarithmic(axes, "time of the loop, s", "estimated distance from the static solution, mm")
     _label_points(figure, axes, [(*point, _INK) for point in points], size=8)
     figure.savefig(path, dpi=150)
 
 
-#: Lines of the chart of energies, by the names of a run's series.
+#: Lines of the chart of energies: names in a run's series, and labels.
 _ENERGIES = {
     "external_work": "external work",
     "strain_energy": "strain energy",
@@ -161,8 +161,13 @@ _ENERGIES = {
 }
 
 
-def draw_history(times: NDArray[np.float64], series: Mapping[str, NDArray[np.float64]], label: str, path: _To) -> None:
-    """Draw energies, kinetic over internal energy, and the smallest J at the frames of a run; label: the time axis."""
+def draw_history(
+    times: NDArray[np.float64], series: Mapping[str, NDArray[np.float64]], label: str, path: _Target
+) -> None:
+    """Draw energies, kinetic over internal energy, and the smallest J at the frames of a run.
+
+    `times` and each of the `series` have the shape (n_frames,); `label` is that of the time axis.
+    """
     figure = Figure(figsize=(13, 4.3), layout="constrained")
     energies, ratio, smallest = figure.subplots(1, 3)
     values = dict(series) | {"artificial": series["hourglass_energy"] + series["stabilisation_energy"]}
@@ -171,8 +176,8 @@ def draw_history(times: NDArray[np.float64], series: Mapping[str, NDArray[np.flo
     power = min(0, 3 * math.floor(math.log10(largest) / 3))
     prefix = {0: "", -3: "m", -6: "\u00b5", -9: "n"}.get(power)
     unit = f"{prefix}J" if prefix is not None else f"1e{power} J"
-    for i, (name, words) in enumerate(_ENERGIES.items(), 1):
-        energies.plot(times, 10.0**-power * values[name], label=words, color=_COLOURS[i], marker=_MARKERS[i], ms=4)
+    for i, (name, text) in enumerate(_ENERGIES.items(), 1):
+        energies.plot(times, 10.0**-power * values[name], label=text, color=_COLOURS[i], marker=_MARKERS[i], ms=4)
     energies.set(xlabel=label, ylabel=f"energy ({unit})", title="energy")
     figure.legend(loc="outside lower left", ncols=len(_ENERGIES), fontsize=8, frameon=False)
     percent = 100 * series["kinetic_ratio"]
@@ -185,8 +190,8 @@ def draw_history(times: NDArray[np.float64], series: Mapping[str, NDArray[np.flo
     figure.savefig(path, dpi=110)
 
 
-def draw_histogram(size: NDArray[np.float64], volumes: NDArray[np.float64], mark: float, path: _To) -> None:
-    """Draw the share of the volume for each displacement (mm), and a line at `mark` (mm)."""
+def draw_histogram(size: NDArray[np.float64], volumes: NDArray[np.float64], mark: float, path: _Target) -> None:
+    """Draw a histogram of displacements `size` (n_cells,), mm, weighted by volume, and a line at `mark` (mm)."""
     figure = Figure(figsize=(8, 4), layout="constrained")
     axes = figure.add_subplot(xlabel="displacement (mm)", ylabel="share of the volume (%)", yscale="log")
     share = 100 * volumes / volumes.sum()
@@ -199,15 +204,15 @@ def draw_histogram(size: NDArray[np.float64], volumes: NDArray[np.float64], mark
     figure.savefig(path, dpi=110)
 
 
-def draw_balance(grown: float, found: Mapping[str, float], path: _To) -> None:
-    """Draw the volume that a tumour added (mm3), and below it the volumes where it was found, one after the other."""
+def draw_balance(added: float, parts: Mapping[str, float], path: _Target) -> None:
+    """Draw the volume that a tumour added (mm3), and the parts (mm3) that account for it, one after the other."""
     figure = Figure(figsize=(8, 2.4), layout="constrained")
     axes = figure.add_subplot(xlabel="volume (mm\u00b3)")
-    axes.barh(1, grown, color=_COLOURS[2], label="added by the tumour")
+    axes.barh(1, added, color=_COLOURS[2], label="added by the tumour")
     begin = 0.0
-    for (name, volume), colour in zip(found.items(), (_COLOURS[1], _COLOURS[6]), strict=True):
+    for (name, volume), colour in zip(parts.items(), (_COLOURS[1], _COLOURS[6]), strict=True):
         axes.barh(0, volume, left=begin, color=colour, label=name)
         begin += volume
-    axes.set_yticks([0, 1], ["found", "added"])
+    axes.set_yticks([0, 1], ["accounted for", "added"])
     figure.legend(loc="outside lower center", ncols=3, frameon=False)
     figure.savefig(path, dpi=110)

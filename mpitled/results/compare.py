@@ -1,4 +1,4 @@
-"""Errors of a result against a reference: the field of another solver at its own points, or another result."""
+"""Errors of a result against a reference: another solver's displacements at given points, or another result."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import io
 import json
 import re
 import zipfile
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,43 +27,44 @@ from mpitled.readers.meshfile import MAX_COORDINATE
 from mpitled.results import field
 from mpitled.results.field import Field
 
-#: Meanings of the tags of a reference. Fixed and moved points are prescribed: their errors do not count as "free".
+#: Meanings of the tags of a reference. Fixed and moved points are prescribed, and so do not belong to "free".
 TAGS = ("interior", "free surface", "fixed", "moved", "material interface")
 _PRESCRIBED = (2, 3)
-#: A reference for several tumours applies to a run whose tumour radius is within this share of one of theirs.
-_SAME_RADIUS = 1e-3
-_SHOWN = 4  # keys in which two scenes differ that a message names
-_SAMPLES = 32  # points on each edge, for distances from it
+#: A reference for several tumours applies to a run whose tumour has one of their radii, to this relative difference.
+_RADIUS_RTOL = 1e-3
+_MAX_KEYS = 4  # differing keys that a message names
+_SAMPLES = 32  # points on each edge, from which distances are measured
 
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """A displacement field that counts as exact, at points of the undeformed body."""
+    """A displacement field that is taken as exact, at n points of the undeformed body."""
 
-    places: NDArray[np.float64]  # (n, 3), m
+    positions: NDArray[np.float64]  # (n, 3), m
     displacement: NDArray[np.float64]  # (n, 3), m
-    error: NDArray[np.float64] | None = None  # (n,), m: estimate by its authors, of the largest component
+    error: NDArray[np.float64] | None = None  # (n,), m: the reference's own error estimate, of the largest component
     tag: NDArray[np.int64] | None = None  # (n,), index into TAGS
     deck: dict[str, Any] | None = None  # if the reference is a run of mpitled
 
 
 def compare(result: Path, reference: Path, beyond: float | None = None) -> dict[str, Any]:
-    """Figures of the difference, in mm, in the last frame of a run.
+    """Differences, in mm, between the last frame of a run and a reference, by groups of points.
 
-    Groups are "all", "free" (not prescribed), each tag of the reference, and with `beyond` (m) "free beyond" that
-    distance from edges between the free surface and nodes prescribed in all directions, where the field is singular.
+    Groups are "all", "free" (not prescribed) and each tag of the reference. With `beyond` (m) the group "free beyond"
+    has the free points that are farther than this from edges between the free surface and the surface that is
+    prescribed in all directions: the field is singular at such edges. Errors are those of `read_reference`.
     """
     ours = field.open_field(result)
     theirs = read_reference(reference, ours)
-    values = ours.at(theirs.places)
+    values = ours.at(theirs.positions)
     difference = values.displacement - theirs.displacement
-    every = np.ones(len(difference), bool)
-    free = every if theirs.tag is None else ~np.isin(theirs.tag, _PRESCRIBED)
-    groups = {"all": every, "free": free}
+    everywhere = np.ones(len(difference), bool)
+    free = everywhere if theirs.tag is None else ~np.isin(theirs.tag, _PRESCRIBED)
+    groups = {"all": everywhere, "free": free}
     if theirs.tag is not None:
         groups |= {name: theirs.tag == tag for tag, name in enumerate(TAGS) if (theirs.tag == tag).any()}
     if beyond is not None:
-        groups["free beyond"] = free & (edge_distance(ours.model, theirs.places) > beyond)
+        groups["free beyond"] = free & (edge_distance(ours.model, theirs.positions) > beyond)
     return {
         "result": str(result),
         "reference": str(reference),
@@ -73,7 +76,7 @@ def compare(result: Path, reference: Path, beyond: float | None = None) -> dict[
         "in_hexahedra": int(np.count_nonzero(values.source == field.IN_HEXAHEDRON)),
         "in_cloud": int(np.count_nonzero(values.source == field.IN_CLOUD)),
         "outside": int(np.count_nonzero(values.source == field.OUTSIDE)),
-        "beside_the_body": int(np.count_nonzero(values.outside > _edge(ours.model))),
+        "beside_the_body": int(np.count_nonzero(values.outside > _mean_edge(ours.model))),
         "farthest_outside_mm": 1e3 * float(values.outside.max(initial=0)),
         "groups": {name: _figures(theirs, difference, chosen) for name, chosen in groups.items() if chosen.any()},
     }
@@ -83,49 +86,46 @@ def table(figures: dict[str, Any]) -> str:
     """The figures of `compare` as a table for the terminal."""
     lines = [
         f"{figures['result']} against {figures['reference']}",
-        f"{figures['in_hexahedra']} places in hexahedra, {figures['in_cloud']} in the cloud, {figures['outside']} "
+        f"{figures['in_hexahedra']} points in hexahedra, {figures['in_cloud']} in the cloud, {figures['outside']} "
         f"outside (at most {figures['farthest_outside_mm']:.3f} mm); "
         f"largest displacement {figures['largest_displacement_mm']:.3f} mm",
     ]
     if figures["beside_the_body"]:
         lines.append(
-            f"warning: {figures['beside_the_body']} places lie outside the body by more than the edge of a cell; are "
-            "both of the same body, and in metres?"
+            f"warning: {figures['beside_the_body']} points lie outside the body by more than the edge of a cell; check "
+            "that result and reference are of the same body, and in metres"
         )
     if keys := figures["scene_differs_in"]:
-        more = f" and {len(keys) - _SHOWN} more" if len(keys) > _SHOWN else ""
-        lines.append(f"note: the scenes differ in {', '.join(keys[:_SHOWN])}{more}")
+        more = f" and {len(keys) - _MAX_KEYS} more" if len(keys) > _MAX_KEYS else ""
+        lines.append(f"note: the scenes differ in {', '.join(keys[:_MAX_KEYS])}{more}")
     if not figures["complete"]:
         lines.append(f"note: the run is not complete; its last frame is at {figures['load']:.1%} of the load time")
     lines.append(
         f"{'':24}{'':>8}{'largest error, mm':>36}{'rms error, mm':>36}{'share of':>9}{'reference':>11}\n"
-        f"{'':24}{'places':>8}"
+        f"{'':24}{'points':>8}"
         + 2 * "".join(f"{c:>9}" for c in ("x", "y", "z", "norm"))
         + f"{'largest':>9}{'err, mm':>11}"
     )
     for name, group in figures["groups"].items():
         label = f"{name} {figures['beyond_mm']:g} mm" if name == "free beyond" else name
         numbers = "".join(f"{number:9.4f}" for number in (*group["largest_mm"], *group["rms_mm"]))
-        own = group["reference_error_mm"]
-        lines.append(
-            f"{label:24}{group['places']:8}{numbers}{group['share_of_largest']:9.2%}"
-            + (f"{'-':>11}" if own is None else f"{own:11.4f}")
-        )
+        uncertainty = "-" if (error := group["reference_error_mm"]) is None else f"{error:.4f}"
+        lines.append(f"{label:24}{group['places']:8}{numbers}{group['share_of_largest']:9.2%}{uncertainty:>11}")
     return "\n".join(lines)
 
 
 def _differing(ours: dict[str, Any], theirs: dict[str, Any] | None) -> list[str]:
-    """Keys of the scene that differ between both runs; none if the reference is no run."""
-    found = []
-    for name, *values in deck.differences(ours, theirs or ours):
-        moved = all(isinstance(value, str) for value in values) and len({Path(value).name for value in values}) == 1
-        if deck.changes_physics(name) and not moved:  # a moved file may be the same
-            found.append(name)
-    return found
+    """Keys of the scene that differ between both runs; none if the reference is not a run."""
+
+    def same_file(values: list[Any]) -> bool:  # in another folder
+        return all(isinstance(value, str) for value in values) and len({Path(value).name for value in values}) == 1
+
+    differences = deck.differences(ours, theirs or ours)
+    return [key for key, *values in differences if deck.changes_physics(key) and not same_file(values)]
 
 
-def _edge(model: Model) -> float:
-    """Mean edge of the hexahedra, m: the surfaces of different meshes of a body differ by less."""
+def _mean_edge(model: Model) -> float:
+    """Mean edge of the hexahedra, m. Surfaces of different meshes of a body differ by less."""
     sizes = hexahedra.volumes(model.points, model.hexahedra)
     return float(np.cbrt(sizes.mean())) if len(sizes) else float("inf")
 
@@ -135,35 +135,37 @@ def _largest(displacement: NDArray[np.float64]) -> float:
 
 
 def _figures(reference: Reference, difference: NDArray[np.float64], chosen: NDArray[np.bool_]) -> dict[str, Any]:
-    """Largest and root mean square of x, y, z and the norm over the chosen places."""
-    four = 1e3 * np.abs(np.column_stack([difference, np.linalg.norm(difference, axis=1)])[chosen])
+    """Largest value and root mean square of x, y, z and the norm of the difference over the chosen points."""
+    errors = 1e3 * np.abs(np.column_stack([difference, np.linalg.norm(difference, axis=1)])[chosen])
     largest = _largest(reference.displacement)
     return {
-        "places": len(four),
-        "largest_mm": four.max(axis=0).tolist(),
-        "rms_mm": np.sqrt((four**2).mean(axis=0)).tolist(),
-        "share_of_largest": float(four[:, 3].max() / largest) if largest else 0.0,
+        "places": len(errors),
+        "largest_mm": errors.max(axis=0).tolist(),
+        "rms_mm": np.sqrt((errors**2).mean(axis=0)).tolist(),
+        "share_of_largest": float(errors[:, 3].max() / largest) if largest else 0.0,
         "reference_error_mm": None if reference.error is None else 1e3 * float(reference.error[chosen].max()),
-        "worst_place_mm": (1e3 * reference.places[chosen][four[:, 3].argmax()]).tolist(),
+        "worst_place_mm": (1e3 * reference.positions[chosen][errors[:, 3].argmax()]).tolist(),
     }
 
 
 # --- edges ---------------------------------------------------------------------------------------------------------
 
 
-def edge_distance(model: Model, places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances (n,), m, of places (n, 3) from edges between prescribed and free surface; infinite without an edge.
+def edge_distance(model: Model, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances (n,), m, of positions (n, 3) from edges between prescribed and free surface; infinite without an edge.
 
-    On hexahedra an edge is between a face whose nodes are all prescribed in all directions and another face. A surface
-    of EFG nodes has no faces: there the prescribed nodes count that have a free node among their three nearest.
+    On hexahedra an edge separates a face with all nodes prescribed in all directions from another face. A surface of
+    EFG nodes has no faces. Its edge consists of the prescribed nodes that have a free node among the nearest three.
     """
-    held, _ = field.prescribed(model)
+    clamped, _ = field.prescribed(model)
     faces = field.outer_faces(model)
     edges = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
-    unique, which = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
-    of_held = np.repeat(held[faces].all(axis=1), 4)
-    between = [np.bincount(which.ravel(), side, len(unique)) > 0 for side in (of_held, ~of_held)]
-    ends = model.points[unique[between[0] & between[1]]]
+    unique, index = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
+    of_clamped = np.repeat(clamped[faces].all(axis=1), 4)
+    beside_clamped, beside_free = (
+        np.bincount(index.ravel(), side, len(unique)) > 0 for side in (of_clamped, ~of_clamped)
+    )
+    ends = model.points[unique[beside_clamped & beside_free]]
     share = np.linspace(0, 1, _SAMPLES)[:, None, None]
     on_edges = ((1 - share) * ends[:, 0] + share * ends[:, 1]).reshape(-1, 3)
 
@@ -171,34 +173,34 @@ def edge_distance(model: Model, places: NDArray[np.float64]) -> NDArray[np.float
     outer = outer[outer >= model.n_fe_nodes].astype(np.int64)
     if len(outer):
         near = cKDTree(model.points[outer]).query(model.points[outer], min(4, len(outer)))[1].reshape(len(outer), -1)
-        last = outer[held[outer] & ~held[outer[near]].all(axis=1)]
-        on_edges = np.concatenate([on_edges, model.points[last]])
-    return np.asarray(cKDTree(on_edges).query(places)[0]) if len(on_edges) else np.full(len(places), np.inf)
+        rim = outer[clamped[outer] & ~clamped[outer[near]].all(axis=1)]
+        on_edges = np.concatenate([on_edges, model.points[rim]])
+    return np.asarray(cKDTree(on_edges).query(positions)[0]) if len(on_edges) else np.full(len(positions), np.inf)
 
 
 # --- references ----------------------------------------------------------------------------------------------------
 
 
 def read_reference(path: Path, ours: Field) -> Reference:
-    """A reference for the run: .npz, .csv, .vtu or .vtkhdf, all in metres, or another run's folder or result.
+    """Read a reference for a run: .npz, .csv, .vtu or .vtkhdf, all in metres, or another run's folder or result.
 
-    An .npz holds X (n, 3), u (n, 3) and optionally err_u (n,) and tag (n,); u (k, n, 3) belongs to the k tumour radii
-    of "R" in its JSON string `meta`. A .csv has a line of names, x, y, z, ux, uy, uz and optionally err and tag. VTK
-    files need PyVista and a point array of displacements. InputError if there is no such file or it is invalid.
+    An .npz file has X (n, 3), u (n, 3) and optionally err_u (n,) and tag (n,). In a file for k tumour radii u has the
+    shape (k, n, 3), and the JSON string `meta` has the radii under "R". A .csv file has the columns x, y, z, ux, uy, uz
+    and optionally err and tag, with names in the first line. A VTK file needs PyVista and a point array of
+    displacements. InputError if there is no such file, or if it is invalid.
     """
-    if not path.exists():
-        raise InputError(f"{path}: does not exist; give .npz, .csv, .vtu, .vtkhdf or the folder of a run")
-    if path.is_dir():
+    if path.is_dir() or (path.suffix == ".vtkhdf" and path.exists() and store.is_result(path)):
         return _of_result(path)
-    if path.suffix == ".npz":
-        return _of_npz(path, ours)
-    if path.suffix == ".csv":
-        return _of_csv(path)
-    if path.suffix == ".vtkhdf" and store.is_result(path):
-        return _of_result(path)
-    if path.suffix in (".vtu", ".vtkhdf"):
-        return _of_vtk(path)
-    raise InputError(f"{path}: is not a reference; give .npz, .csv, .vtu, .vtkhdf or the folder of a run")
+    readers: dict[str, Callable[[Path], Reference]] = {
+        ".npz": partial(_of_npz, ours=ours),
+        ".csv": _of_csv,
+        ".vtu": _of_vtk,
+        ".vtkhdf": _of_vtk,
+    }
+    if not path.exists() or path.suffix not in readers:
+        problem = "is not a reference" if path.exists() else "does not exist"
+        raise InputError(f"{path}: {problem}; give .npz, .csv, .vtu, .vtkhdf or the folder of a run")
+    return readers[path.suffix](path)
 
 
 def _of_result(path: Path) -> Reference:
@@ -206,14 +208,15 @@ def _of_result(path: Path) -> Reference:
     theirs = field.open_field(path)
     if not theirs.complete:
         raise InputError(f"{path}: the run is not complete; run it again")
-    held, moves = field.prescribed(theirs.model)
-    tag = np.zeros(theirs.model.n_nodes, np.int64)
-    tag[np.unique(field.outer_faces(theirs.model))] = TAGS.index("free surface")
+    model = theirs.model
+    clamped, moving = field.prescribed(model)
+    tag = np.zeros(model.n_nodes, np.int64)
+    tag[field.outer_faces(model)] = TAGS.index("free surface")
     for name in OUTER:
-        tag[theirs.model.node_sets.get(name, [])] = TAGS.index("free surface")
-    tag[held] = TAGS.index("fixed")
-    tag[moves] = TAGS.index("moved")
-    return Reference(theirs.model.points, theirs.at_nodes, None, tag, theirs.metadata["deck"])
+        tag[model.node_sets.get(name, [])] = TAGS.index("free surface")
+    tag[clamped] = TAGS.index("fixed")
+    tag[moving] = TAGS.index("moved")
+    return Reference(model.points, theirs.at_nodes, None, tag, theirs.metadata["deck"])
 
 
 def _of_npz(path: Path, ours: Field) -> Reference:
@@ -222,7 +225,7 @@ def _of_npz(path: Path, ours: Field) -> Reference:
         with zipfile.ZipFile(path) as archive:
             # The arrays may be a thousand times larger than the compressed file.
             size = sum(member.file_size for member in archive.infolist() if member.filename[:-4] in names)
-        resources.check_memory(4 * size, f"{path}: its arrays", "give fewer places")
+        resources.check_memory(4 * size, f"{path}: its arrays", "give fewer points")
         with np.load(path, allow_pickle=False) as arrays:
             data = {name: np.asarray(arrays[name]) for name in names if name in arrays}
         meta = dict(json.loads(str(data.pop("meta", "{}"))))
@@ -231,11 +234,11 @@ def _of_npz(path: Path, ours: Field) -> Reference:
             raise ValueError("an array is not numeric")
     except InputError:
         raise
-    except Exception as problem:  # zip and numpy raise any kind
+    except Exception as problem:  # zipfile and numpy raise many types
         reason = " ".join(str(problem).split())[:100] or type(problem).__name__
         raise InputError(f"{path}: cannot be read as .npz ({reason}); write it again with numpy.savez") from None
     if "X" not in data or "u" not in data:
-        raise InputError(f"{path}: has no arrays X and u, places (n, 3) and displacements (n, 3)")
+        raise InputError(f"{path}: has no arrays X and u: positions (n, 3) and displacements (n, 3)")
     u, error = data["u"], data.get("err_u")
     if u.ndim == 3:
         row = _row(path, radii, len(u), ours)
@@ -244,23 +247,21 @@ def _of_npz(path: Path, ours: Field) -> Reference:
 
 
 def _row(path: Path, radii: NDArray[np.float64], n: int, ours: Field) -> int:
-    """The row of the run's tumour among those of a reference."""
+    """The index of the run's tumour radius among the n radii (m) of a reference."""
     if len(radii) != n:
         raise InputError(f'{path}: u has {n} loads, but meta names {len(radii)} tumour radii ("R", in m)')
-    shown = ", ".join(f"{1e3 * radius:.4g}" for radius in radii)
+    tumours = f"{path}: has tumours of {', '.join(f'{1e3 * radius:.4g}' for radius in radii)} mm radius"
     tumour = ours.metadata["tumour"]
     if not tumour:
-        raise InputError(f"{path}: has tumours of {shown} mm radius, but the run has no tumour")
+        raise InputError(f"{tumours}, but the run has no tumour")
     row = int(np.abs(radii - tumour["radius_m"]).argmin())
-    if abs(radii[row] - tumour["radius_m"]) > _SAME_RADIUS * radii[row]:
-        raise InputError(
-            f"{path}: has tumours of {shown} mm radius, the run's tumour has {1e3 * tumour['radius_m']:.4g} mm"
-        )
+    if abs(radii[row] - tumour["radius_m"]) > _RADIUS_RTOL * radii[row]:
+        raise InputError(f"{tumours}, the run's tumour has {1e3 * tumour['radius_m']:.4g} mm")
     return row
 
 
 def _of_csv(path: Path) -> Reference:
-    file = io.StringIO(text.decode(text.read_text(path, "a table of places and displacements (CSV)")))
+    file = io.StringIO(text.decode(text.read_text(path, "a table of positions and displacements (CSV)")))
     with damaged(path, "give x, y, z, ux, uy, uz in each line"):
         rows = csv.reader(file)
         names = [name.strip() for name in next(rows, [])]
@@ -276,8 +277,8 @@ def _of_csv(path: Path) -> Reference:
             if len(row) != len(names):
                 raise InputError(f"{path}: line {rows.line_num}: has {len(row)} numbers for {len(names)} columns")
     column = dict(zip(names, np.array(values).reshape(-1, len(names)).T, strict=True))
-    places, u = (np.column_stack([column[a + axis] for axis in "xyz"]) for a in ("", "u"))
-    return _checked(path, Reference(places, u, column.get("err"), column.get("tag")))
+    positions, u = (np.column_stack([column[prefix + axis] for axis in "xyz"]) for prefix in ("", "u"))
+    return _checked(path, Reference(positions, u, column.get("err"), column.get("tag")))
 
 
 def _of_vtk(path: Path) -> Reference:
@@ -290,7 +291,7 @@ def _of_vtk(path: Path) -> Reference:
         _check_vtu(path)
     with pyvista.vtk_verbosity("off"), damaged(path, "give an unstructured grid of VTK"):
         reader: Any = pyvista.get_reader(path)
-        if path.suffix == ".vtkhdf":  # PyVista has no choice of the step
+        if path.suffix == ".vtkhdf":  # PyVista cannot select the step
             reader.reader.UpdateInformation()
             reader.reader.SetStep(max(reader.reader.GetNumberOfSteps() - 1, 0))
         grid: Any = reader.read()
@@ -304,34 +305,27 @@ def _of_vtk(path: Path) -> Reference:
 
 
 def _check_vtu(path: Path) -> None:
-    """InputError if an XML file declares more points or cells than its bytes can hold: VTK allocates them first."""
+    """InputError if an XML file declares more points or cells than its bytes can hold: VTK would allocate them."""
     content = path.read_bytes()
-    claims = [int(n) for n in re.findall(rb'NumberOf(?:Points|Cells|Tuples|Components)\s*=\s*["\'](\d{1,18})', content)]
-    if max(claims, default=0) > 1000 * len(content) or re.search(rb'NumberOf\w+\s*=\s*["\']\s*[+-]?\d{19}', content):
-        raise InputError(
-            f"{path}: declares {max(claims, default=0)} points or cells in {len(content)} bytes; write it again"
-        )
+    counts = re.findall(rb'NumberOf(?:Points|Cells|Tuples|Components)\s*=\s*["\'](\d{1,18})', content)
+    declared = max(map(int, counts), default=0)
+    if declared > 1000 * len(content) or re.search(rb'NumberOf\w+\s*=\s*["\']\s*[+-]?\d{19}', content):
+        raise InputError(f"{path}: declares {declared} points or cells in {len(content)} bytes; write it again")
 
 
 def _checked(path: Path, reference: Reference) -> Reference:
     """The reference in float64. InputError if its arrays do not fit together."""
-    n = len(reference.places)
-    for name, shape in {"places": (n, 3), "displacement": (n, 3), "error": (n,), "tag": (n,)}.items():
+    n = len(reference.positions)
+    for name, shape in {"positions": (n, 3), "displacement": (n, 3), "error": (n,), "tag": (n,)}.items():
         array = getattr(reference, name)
         if array is not None and (array.shape != shape or not np.isfinite(array).all()):
-            raise InputError(f"{path}: {name} has shape {array.shape} for {n} places, or values that are not finite")
-    if (
-        not (np.abs(reference.places) < MAX_COORDINATE).all()
-        or not (np.abs(reference.displacement) < MAX_COORDINATE).all()
-    ):
-        raise InputError(f"{path}: has places or displacements beyond {MAX_COORDINATE:g} m; correct them")
+            raise InputError(f"{path}: {name} has shape {array.shape} for {n} points, or values that are not finite")
+    if not all((np.abs(array) < MAX_COORDINATE).all() for array in (reference.positions, reference.displacement)):
+        raise InputError(f"{path}: has positions or displacements beyond {MAX_COORDINATE:g} m; correct them")
     if n == 0:
-        raise InputError(f"{path}: has no places")
+        raise InputError(f"{path}: has no points")
     tag = None if reference.tag is None else reference.tag.astype(np.int64)
     if tag is not None and not np.isin(tag, range(len(TAGS))).all():
         raise InputError(f"{path}: tag has numbers other than 0 to {len(TAGS) - 1} ({', '.join(TAGS)})")
     error = None if reference.error is None else reference.error.astype(float)
-    return replace(
-        reference, places=reference.places.astype(float), displacement=reference.displacement.astype(float),
-        error=error, tag=tag,
-    )  # fmt: skip
+    return Reference(reference.positions.astype(float), reference.displacement.astype(float), error, tag)

@@ -22,17 +22,17 @@ IN_HEXAHEDRON, IN_CLOUD, OUTSIDE = 0, 1, 2
 
 _CANDIDATES = (1, 16, 64)  # hexahedra with the nearest centres, more if a nearer hexahedron is possible
 _INSIDE = 1 + 1e-9  # in reference coordinates: a point on a face belongs to both cells
-_ITERATIONS = 30  # of Newton; undistorted cells need 4
-#: Newton in the cloud: most steps, the longest step (m), and the distance (m) at which it has converged.
-_STEPS, _STEP, _CLOSE = 12, 1e-3, 1e-6
-_CHUNK = 1 << 12  # points at once, to keep temporary arrays small
-# The eight sign products of the corners, whose coefficients make the trilinear map a polynomial.
+_MAX_ITERATIONS = 30  # of Newton's method; undistorted cells need 4
+#: Newton's method in the cloud: number of steps, length of a step (m), and the distance (m) at which it has converged.
+_MAX_STEPS, _MAX_STEP, _TOLERANCE = 12, 1e-3, 1e-6
+_CHUNK = 1 << 12  # points in one batch, to keep temporary arrays small
+# Signs of the eight monomials 1, r, s, t, rs, st, rt, rst at the corners: they give the trilinear map's coefficients.
 _r, _s, _t = CORNERS.T.astype(float)
 _MODES = np.stack([np.ones(8), _r, _s, _t, _r * _s, _s * _t, _r * _t, _r * _s * _t])
 
 
 class Values(NamedTuple):
-    """The field at places (n, 3)."""
+    """The field at n points."""
 
     displacement: NDArray[np.float64]  # (n, 3), m
     source: NDArray[np.int8]  # (n,), IN_HEXAHEDRON, IN_CLOUD or OUTSIDE
@@ -40,10 +40,10 @@ class Values(NamedTuple):
 
 
 class Origins(NamedTuple):
-    """Points of the undeformed body for points (n, 3) of the deformed body."""
+    """Undeformed positions of n points of the deformed body."""
 
-    place: NDArray[np.float64]  # (n, 3), m
-    missed: NDArray[np.float64]  # (n,), m: distance of their deformed positions from the given points
+    position: NDArray[np.float64]  # (n, 3), m
+    missed: NDArray[np.float64]  # (n,), m: distance between the deformed origin and the given point
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,95 +56,96 @@ class Field:
     basis: int
     weight: str
     share: float  # of the load time
-    complete: bool  # whether the run came to its end
+    complete: bool  # whether the run reached its end
     metadata: dict[str, Any]  # recorded at the start of the run
 
-    def at(self, places: NDArray[np.float64]) -> Values:
-        """The field at places (n, 3), m, of the undeformed body.
+    def at(self, positions: NDArray[np.float64]) -> Values:
+        """The field at positions (n, 3), m, of the undeformed body.
 
-        A point outside the mesh, for instance on a curved surface, has the value of the map of the nearest hexahedron.
-        In the cloud the support domain of the nearest integration point gives the value.
+        A point outside the mesh, for instance on a curved surface, has the extrapolated value of the nearest
+        hexahedron. In the cloud the support domain of the nearest integration point gives the value.
         """
-        model, n = self.model, len(places)
-        cells, xi, outside = locate(model.points, model.hexahedra, places)
+        model = self.model
+        cells, xi, outside = locate(model.points, model.hexahedra, positions)
         source = np.where(outside > 0, OUTSIDE, IN_HEXAHEDRON).astype(np.int8)
         if len(model.domains):
             source[self._across_interface(cells, xi) & (outside > 0)] = IN_CLOUD
-        displacement = np.empty((n, 3))
+        displacement = np.empty((len(positions), 3))
         fe = source != IN_CLOUD
-        displacement[fe] = np.einsum("na,nai->ni", _shapes(xi[fe]), self.parameters[model.hexahedra[cells[fe]]])
+        displacement[fe] = np.einsum(
+            "na,nai->ni", _shape_functions(xi[fe]), self.parameters[model.hexahedra[cells[fe]]]
+        )
         if not fe.all():
-            displacement[~fe] = self._in_cloud(places[~fe])[0]
+            displacement[~fe] = self._in_cloud(positions[~fe])[0]
         return Values(displacement, source, np.where(fe, outside, 0.0))
 
-    def origins(self, places: NDArray[np.float64]) -> Origins:
+    def origins(self, positions: NDArray[np.float64]) -> Origins:
         """Undeformed positions of the tissue at points (n, 3), m, of the deformed body.
 
-        In hexahedra and outside the mesh it is the inverse of the hexahedron's map, to round-off. In the cloud Newton's
-        method finds it: near a grown tumour the gradient is too large for a fixed-point iteration. The field jumps
-        between support domains, so a few points in the cloud are only found to within such a jump.
+        In hexahedra and outside the mesh the hexahedron's map is inverted, to round-off. In the cloud Newton's method
+        is used, because near a grown tumour the gradient is too large for a fixed-point iteration. The field is not
+        continuous between support domains. The error at a few points in the cloud is therefore as large as a jump.
         """
-        model, n = self.model, len(places)
-        cells, xi, outside = locate(model.points + self.parameters, model.hexahedra, places)
+        model, n = self.model, len(positions)
+        cells, xi, outside = locate(model.points + self.parameters, model.hexahedra, positions)
         cloud = np.zeros(n, bool)
         if len(model.domains):
             cloud = self._across_interface(cells, xi) & (outside > 0)
-        found, missed = np.empty((n, 3)), np.zeros(n)
+        undeformed, missed = np.empty((n, 3)), np.zeros(n)
         fe = ~cloud
-        found[fe] = np.einsum("na,nai->ni", _shapes(xi[fe]), model.points[model.hexahedra[cells[fe]]])
+        undeformed[fe] = np.einsum("na,nai->ni", _shape_functions(xi[fe]), model.points[model.hexahedra[cells[fe]]])
         if cloud.any():
-            there = found[cloud] = self._origins_in_cloud(places[cloud])
-            missed[cloud] = np.linalg.norm(there + self.at(there).displacement - places[cloud], axis=1)
-        return Origins(found, missed)
+            in_cloud = undeformed[cloud] = self._origins_in_cloud(positions[cloud])
+            missed[cloud] = np.linalg.norm(in_cloud + self.at(in_cloud).displacement - positions[cloud], axis=1)
+        return Origins(undeformed, missed)
 
-    def _origins_in_cloud(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The best of a few Newton steps from the integration points whose deformed positions are nearest.
+    def _origins_in_cloud(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Undeformed positions (n, 3), m: the best iterates of Newton's method, which starts at the nearest
+        integration points of the deformed cloud.
 
-        The seed of a tumour has no tissue: a point inside it is not an origin, although moving least squares has a
-        value there.
+        Points inside the seed of a tumour are excluded: moving least squares has a value there, but there is no tissue.
         """
         points, tumour = self.model.domain_points, self.metadata.get("tumour")
         centre, seed = (np.array(tumour["centre_m"]), tumour["seed_radius_m"]) if tumour else (np.zeros(3), 0.0)
-        trial = points[cKDTree(points + self._in_cloud(points)[0]).query(places)[1]]
-        best, least = trial.copy(), np.full(len(places), np.inf)
-        moving = np.arange(len(places))
-        for _ in range(_STEPS):
-            at = trial[moving]
-            displacement, gradient = self._in_cloud(at)
-            apart = at + displacement - places[moving]
-            size = np.linalg.norm(apart, axis=1)
-            better = (size < least[moving]) & (np.linalg.norm(at - centre, axis=1) >= seed)
-            least[moving[better]], best[moving[better]] = size[better], at[better]
-            step = np.linalg.solve(np.eye(3) + gradient, apart[..., None])[..., 0]
-            trial[moving] = at - step * (_STEP / np.maximum(np.linalg.norm(step, axis=1), _STEP))[:, None]
-            moving = moving[least[moving] > _CLOSE]
+        trial = points[cKDTree(points + self._in_cloud(points)[0]).query(positions)[1]]
+        best, error = trial.copy(), np.full(len(positions), np.inf)
+        active = np.arange(len(positions))
+        for _ in range(_MAX_STEPS):
+            x = trial[active]
+            displacement, gradient = self._in_cloud(x)
+            residual = x + displacement - positions[active]
+            size = np.linalg.norm(residual, axis=1)
+            better = (size < error[active]) & (np.linalg.norm(x - centre, axis=1) >= seed)
+            error[active[better]], best[active[better]] = size[better], x[better]
+            step = np.linalg.solve(np.eye(3) + gradient, residual[..., None])[..., 0]
+            trial[active] = x - step * (_MAX_STEP / np.maximum(np.linalg.norm(step, axis=1), _MAX_STEP))[:, None]
+            active = active[error[active] > _TOLERANCE]
         return best
 
-    def _in_cloud(self, places: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Displacements (n, 3), m, by the nearest integration points' support domains, and gradients (n, 3, 3)."""
-        nodes = self.model.domains[cKDTree(self.model.domain_points).query(places)[1]]
-        values, gradients, _ = moving_least_squares(self.model.points[nodes], places, self.basis, self.weight)
+    def _in_cloud(self, positions: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Displacements (n, 3), m, and gradients (n, 3, 3), by the nearest integration points' support domains."""
+        nodes = self.model.domains[cKDTree(self.model.domain_points).query(positions)[1]]
+        values, gradients, _ = moving_least_squares(self.model.points[nodes], positions, self.basis, self.weight)
         parameters = self.parameters[nodes]
         return np.einsum("na,nai->ni", values, parameters), np.einsum("naj,nai->nij", gradients, parameters)
 
     def _across_interface(self, cells: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether the nearest face, edge or corner of the hexahedron has interface nodes only, for points outside it.
+        """Whether each point is outside its cell and next to a face, edge or corner that has interface nodes only (n,).
 
         All points are across the interface if there are no hexahedra.
         """
         if not len(self.model.hexahedra):
             return np.ones(len(cells), bool)
-        interface = np.zeros(self.model.n_nodes, bool)
-        interface[self.model.node_sets.get("interface", [])] = True
         beyond = np.abs(xi) > 1
         nearest = ((CORNERS * xi[:, None, :] > 0) | ~beyond[:, None, :]).all(axis=2)  # (n, 8)
-        return np.asarray(beyond.any(axis=1) & (interface[self.model.hexahedra[cells]] | ~nearest).all(axis=1))
+        on_interface = _on_interface(self.model)[self.model.hexahedra[cells]]
+        return np.asarray(beyond.any(axis=1) & (on_interface | ~nearest).all(axis=1))
 
 
 def open_field(path: Path, frame: int = -1) -> Field:
-    """The field of a run's folder, or of its result.vtkhdf beside model.h5, in a frame (negative: from the last).
+    """The field of a run in a frame, from the run's folder or its result.vtkhdf; frame -1 is the last.
 
-    InputError if one of the files is missing, or they do not belong together.
+    InputError if the result or model.h5 is missing, or if the files do not belong together.
     """
     with store.open_result(path) as result, damaged(result.path, "run the deck again"):
         model = store.read_model(result.path.parent / "model.h5")
@@ -166,103 +167,111 @@ def open_field(path: Path, frame: int = -1) -> Field:
 
 
 def locate(
-    points: NDArray[np.float64], hexahedra: NDArray[np.int64], places: NDArray[np.float64]
+    points: NDArray[np.float64], hexahedra: NDArray[np.int64], positions: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Cells (n,), reference coordinates in them (n, 3), and distances to them (n,), m, of places (n, 3).
+    """Cells (n,), reference coordinates in the cells (n, 3), and distances from the cells (n,), m, of positions (n, 3).
 
-    A point in no hexahedron gets the nearest hexahedron, and coordinates beyond [-1, 1]. Its distance is that from the
-    point with the coordinates clipped to [-1, 1]; it is infinite without hexahedra.
+    A point in no hexahedron gets the nearest hexahedron and coordinates beyond [-1, 1]. The distance is measured from
+    the point with the coordinates clipped to [-1, 1]. Distances are infinite if there are no hexahedra.
     """
-    n = len(places)
+    n = len(positions)
     cells, xi, distance = np.zeros(n, np.int64), np.zeros((n, 3)), np.full(n, np.inf)
     if not len(hexahedra):
         return cells, xi, distance
-    middles = points[hexahedra].mean(axis=1)
-    reach = max(np.linalg.norm(points[corner] - middles, axis=1).max() for corner in hexahedra.T)
-    tree = cKDTree(middles)
-    missed = np.arange(n)
+    centres = points[hexahedra].mean(axis=1)
+    radius = max(np.linalg.norm(points[corner] - centres, axis=1).max() for corner in hexahedra.T)
+    tree = cKDTree(centres)
+    remaining = np.arange(n)
     for k in _CANDIDATES:
-        nearer = np.zeros(n, bool)  # whether a hexahedron that was not tried may be nearer
-        for first in range(0, len(missed), _CHUNK):
-            rows = missed[first : first + _CHUNK]
-            apart, near = (of.reshape(len(rows), -1) for of in tree.query(places[rows], min(k, len(hexahedra))))
-            cells[rows], xi[rows], distance[rows] = _best(points, hexahedra, near, places[rows])
-            nearer[rows] = distance[rows] > np.maximum(apart[:, -1] - reach, 0)
-        missed = np.flatnonzero(nearer)
+        untried = np.zeros(n, bool)  # whether a hexahedron that was not tried may be nearer
+        for first in range(0, len(remaining), _CHUNK):
+            rows = remaining[first : first + _CHUNK]
+            nearest = tree.query(positions[rows], min(k, len(hexahedra)))
+            to_centres, candidates = (array.reshape(len(rows), -1) for array in nearest)
+            cells[rows], xi[rows], distance[rows] = _best(points, hexahedra, candidates, positions[rows])
+            untried[rows] = distance[rows] > np.maximum(to_centres[:, -1] - radius, 0)
+        remaining = np.flatnonzero(untried)
     return cells, xi, distance
 
 
 def _best(
-    points: NDArray[np.float64], hexahedra: NDArray[np.int64], near: NDArray[np.int64], places: NDArray[np.float64]
+    points: NDArray[np.float64],
+    hexahedra: NDArray[np.int64],
+    candidates: NDArray[np.int64],
+    positions: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Of candidates (n, k) the cell that contains the point or is nearest to it; see `locate`."""
-    n, k = near.shape
-    corners = points[hexahedra[near.ravel()]]
-    at = np.repeat(places, k, axis=0)
-    xi, converged = _inverse(corners, at)
+    """The candidate cell of (n, k) that contains each point or is nearest to the point; returns as `locate`."""
+    n, k = candidates.shape
+    corners = points[hexahedra[candidates.ravel()]]
+    x = np.repeat(positions, k, axis=0)
+    xi, converged = _invert_map(corners, x)
     inside = np.abs(xi).max(axis=1) <= _INSIDE
-    cut = np.einsum("na,nai->ni", _shapes(np.clip(xi, -1, 1)), corners)
-    distance = np.where(inside, 0.0, np.linalg.norm(cut - at, axis=1))
+    clipped = np.einsum("na,nai->ni", _shape_functions(np.clip(xi, -1, 1)), corners)
+    distance = np.where(inside, 0.0, np.linalg.norm(clipped - x, axis=1))
     distance[~converged] = np.inf
-    # Of cells that share the point the one that contains it best: the answer depends on the geometry only.
+    # If several cells share the point, the smallest coordinates decide: the answer depends on the geometry only.
     order = np.lexsort((np.abs(xi).max(axis=1).reshape(n, k), distance.reshape(n, k)), axis=1)[:, 0]
     best = np.arange(n) * k + order
-    return near.ravel()[best], xi[best], distance[best]
+    return candidates.ravel()[best], xi[best], distance[best]
 
 
-def _inverse(corners: NDArray[np.float64], at: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Reference coordinates (n, 3) of places (n, 3) in trilinear cells (n, 8, 3) by Newton, and where it converged.
+def _invert_map(corners: NDArray[np.float64], x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Reference coordinates (n, 3) of positions (n, 3) in trilinear cells (n, 8, 3), and whether Newton converged (n,).
 
-    Coordinates stay within [-8, 8]: beyond these limits it suffices that the cell is far away.
+    Coordinates are limited to [-8, 8]: a point with such coordinates is far from the cell.
     """
     modes = _MODES @ corners / 8
     size = np.abs(modes[:, 1:4]).max(axis=(1, 2))[:, None]
-    xi = np.zeros_like(at)
-    moving = np.arange(len(at))
-    for _ in range(_ITERATIONS):
-        before, some = xi[moving], modes[moving]
-        apart = (at[moving] - _place(some, before))[..., None]
-        step = np.linalg.solve(_slopes(some, before, size[moving]), apart)[..., 0]
-        xi[moving] = np.clip(before + np.clip(step, -2, 2), -8, 8)
-        # Coordinates that stay at a limit are done as well.
-        moving = moving[np.abs(xi[moving] - before).max(axis=1) >= 1e-13]
-        if not len(moving):
+    xi = np.zeros_like(x)
+    active = np.arange(len(x))
+    for _ in range(_MAX_ITERATIONS):
+        old, active_modes = xi[active], modes[active]
+        residual = (x[active] - _map(active_modes, old))[..., None]
+        step = np.linalg.solve(_map_gradients(active_modes, old, size[active]), residual)[..., 0]
+        xi[active] = np.clip(old + np.clip(step, -2, 2), -8, 8)
+        active = active[np.abs(xi[active] - old).max(axis=1) >= 1e-13]  # coordinates at a limit do not change either
+        if not len(active):
             break
-    return xi, np.abs(at - _place(modes, xi)).max(axis=1) < 1e-9 * size[:, 0]
+    return xi, np.abs(x - _map(modes, xi)).max(axis=1) < 1e-9 * size[:, 0]
 
 
-def _place(modes: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Places (n, 3) at reference coordinates (n, 3)."""
+def _map(modes: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Positions (n, 3) at reference coordinates (n, 3)."""
     r, s, t = xi.T
     return np.einsum("mn,nmi->ni", np.stack([np.ones_like(r), r, s, t, r * s, s * t, r * t, r * s * t]), modes)
 
 
-def _slopes(modes: NDArray[np.float64], xi: NDArray[np.float64], size: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivatives (n, 3, 3), place by reference coordinate, plus a small multiple of the identity: never singular."""
+def _map_gradients(
+    modes: NDArray[np.float64], xi: NDArray[np.float64], size: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Derivatives dx_i/dxi_j (n, 3, 3), plus a small multiple of the identity so that they are never singular."""
     r, s, t = (x[:, None] for x in xi.T)
     _, R, S, T, RS, ST, RT, RST = modes.transpose(1, 0, 2)
-    slopes = np.stack(
-        [R + s * RS + t * RT + s * t * RST, S + r * RS + t * ST + r * t * RST, T + s * ST + r * RT + r * s * RST]
-    )
-    return slopes.transpose(1, 2, 0) + 1e-12 * size[..., None] * np.eye(3)
+    columns = (R + s * RS + t * RT + s * t * RST, S + r * RS + t * ST + r * t * RST, T + s * ST + r * RT + r * s * RST)
+    return np.stack(columns, axis=2) + 1e-12 * size[..., None] * np.eye(3)
 
 
-def _shapes(xi: NDArray[np.float64]) -> NDArray[np.float64]:
+def _shape_functions(xi: NDArray[np.float64]) -> NDArray[np.float64]:
     """Trilinear shape functions (n, 8) at reference coordinates (n, 3) (paper, eq. 4.4)."""
     return (1 + CORNERS * xi[:, None, :]).prod(axis=2) / 8
 
 
 def prescribed(model: Model) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Nodes (n_nodes,) that are prescribed in all three directions, and those of them that move."""
+    """Whether each node (n_nodes,) is prescribed in all three directions, and whether it also moves."""
     nodes = model.prescribed_dofs // 3
-    every = np.bincount(nodes, minlength=model.n_nodes) == 3
+    in_all = np.bincount(nodes, minlength=model.n_nodes) == 3
     moves = np.bincount(nodes, (model.prescribed_displacements != 0) | model.rotation_paths.any(1), model.n_nodes) > 0
-    return every, every & moves
+    return in_all, in_all & moves
 
 
 def outer_faces(model: Model) -> NDArray[np.int64]:
-    """Faces (n, 4) of hexahedra on the body's surface: those of one hexahedron only and not on the cloud."""
+    """Faces (n, 4) of hexahedra on the body's surface: not shared by two hexahedra, and not on the interface."""
     faces = boundary_faces(model.hexahedra)
+    return faces[~_on_interface(model)[faces].all(axis=1)]
+
+
+def _on_interface(model: Model) -> NDArray[np.bool_]:
+    """Whether each node (n_nodes,) is on the interface between hexahedra and cloud."""
     interface = np.zeros(model.n_nodes, bool)
     interface[model.node_sets.get("interface", [])] = True
-    return faces[~interface[faces].all(axis=1)]
+    return interface

@@ -1,4 +1,4 @@
-"""The figures of a report: each is declared once, and report.json, tables, pages and the guide iterate over them."""
+"""The figures of a report, each declared once. Report.json, tables, pages and guide iterate over the declarations."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ RELAXATION = "dynamic-relaxation"
 class Figure:
     """The declaration of a figure: one number, or one number for each part (side, phase, kind of cell, rank)."""
 
-    label: str = ""  # in the table; without a label the figure is in report.json only
+    label: str = ""  # in the table; a figure without a label is in report.json only
     unit: str = ""
     form: str = ""  # format specification of the number
     meaning: str = ""  # in the guide
-    headline: bool = False  # whether the short table has it, which a run prints at its end
+    headline: bool = False  # whether the figure is in the short table at the end of a run
     limit: float | None = None  # the report warns of a larger value
-    relaxation: bool | None = None  # True: of dynamic relaxation only; False: of the other methods only
+    relaxation: bool | None = None  # True: dynamic relaxation only; False: all other methods only
     scale: float = 1.0  # factor from the value in report.json to the unit
     total: bool = False  # whether the table shows the sum of the parts
-    key: str = ""  # in report.json, by default the field's name; "a.b" is b inside of a
-    part: str = ""  # the only part of the field that the table shows on this line
+    key: str = ""  # in report.json, by default the field's name; "a.b" is the key b in the object a
+    part: str = ""  # the part of the field that this line of the table shows; all parts if empty
 
     def text(self, value: Any) -> str:
-        """The value as a cell of a table: parts are listed with their names, values of ranks without."""
+        """The value as a table cell: named parts with their names, a list (of ranks) without names."""
         if isinstance(value, Mapping):
             if self.total:
                 return self.text(sum(value.values()))
-            named = (f"{self.text(part)} {name.replace('_', ' ')}" for name, part in value.items() if part is not None)
-            return ", ".join(named)
+            parts = ((name.replace("_", " "), part) for name, part in value.items() if part is not None)
+            return ", ".join(f"{self.text(part)} {name}" for name, part in parts)
         if isinstance(value, list):
             return ", ".join(map(self.text, value))
         return f"{self.scale * value if self.scale != 1 else value:{self.form}} {self.unit}".rstrip()
 
 
 def look_up(report: Mapping[str, Any], key: str) -> Any:
-    """The value under a key ("a.b") of report.json; None if the report has none."""
+    """The value of a key ("a.b") of report.json; None if there is no such key."""
     value: Any = report
     for part in key.split("."):
         value = value.get(part) if isinstance(value, Mapping) else None
@@ -46,12 +46,12 @@ def look_up(report: Mapping[str, Any], key: str) -> Any:
 
 
 def rows(report: Mapping[str, Any], *, headlines: bool = False) -> Iterator[tuple[str, str]]:
-    """Label and value of each figure in the table of report.json; of the headlines only if they are asked for."""
+    """Label and value of each figure that report.json has, or of its headlines only."""
     relaxed = report.get("method") == RELAXATION
     for figure in FIGURES:
-        shown = (figure.headline or not headlines) and figure.relaxation in (None, relaxed)
-        value = look_up(report, figure.key) if shown else None
-        if value is not None and value != {}:  # of a killed run there are no phases
+        selected = (figure.headline or not headlines) and figure.relaxation in (None, relaxed)
+        value = look_up(report, figure.key) if selected else None
+        if value is not None and value != {}:  # a killed run has no phases
             yield figure.label, figure.text(value)
 
 
@@ -76,17 +76,17 @@ class LowestJacobian:
 
 @dataclass(slots=True, kw_only=True)
 class Report:
-    """The figures of a run in the user's units, in the order of the table; None where the scene has no such figure."""
+    """The figures of a run in the user's units, in the order of the table; None if the scene has no such figure."""
 
     title: str = ""
-    complete: bool = False  # whether the run came to its end
+    complete: bool = False  # whether the run reached its end
     load_share: float = 0.0
     method: str | None = None
-    stopped: str | None = None  # why the run did not come to its end
+    stopped: str | None = None  # the reason why the run did not reach its end
     max_displacement_mm: Annotated[
         float,
         Figure("largest displacement", "mm", ".2f", headline=True,
-               meaning="of all nodes; beside a grown tumour the node lies on the tumour's own surface"),
+               meaning="of all nodes; if a tumour grows, the node is usually on the tumour's surface"),
     ] = 0.0  # fmt: skip
     max_displacement_outside_first_ring_mm: Annotated[
         float | None,
@@ -142,7 +142,7 @@ class Report:
     cloud_misfit_of_90_percent_mm: float | None = None
     static_distance_mm: Annotated[
         float | None,
-        Figure("from the static solution, by its own estimate", "mm", ".2g", headline=True, limit=0.5,
+        Figure("distance from the static solution, estimated", "mm", ".2g", headline=True, limit=0.5,
                meaning="how far the run ended from the static solution of its mesh: an error of iteration, not of the "
                "mesh; the report warns above 0.5 mm"),
     ] = None  # fmt: skip
@@ -205,22 +205,22 @@ class Report:
         None
     )
     warnings: list[str] = field(default_factory=list)
-    pictures: list[str] | str = ""  # names of files, or why there are none
+    pictures: list[str] | str = ""  # names of files, or the reason why there are none
     other: dict[str, Any] = field(default_factory=dict)  # figures of the solver that are not declared here
 
     def as_json(self) -> dict[str, Any]:
-        """The content of report.json: absent figures are left out, and numbers that are not finite are null."""
-        made: dict[str, Any] = dict(self.other)
+        """The content of report.json: absent figures are omitted, and numbers that are not finite are null."""
+        content: dict[str, Any] = dict(self.other)
         for name, key in _KEYS.items():
             value = getattr(self, name)
             if value is not None:
                 outer, _, inner = key.rpartition(".")
-                into = made.setdefault(outer, {}) if outer else made
-                into[inner] = asdict(value) if isinstance(value, LowestJacobian) else value
-        return dict(_finite(made))
+                parent = content.setdefault(outer, {}) if outer else content
+                parent[inner] = asdict(value) if isinstance(value, LowestJacobian) else value
+        return dict(_finite(content))
 
     def set_figures(self, figures: Mapping[str, Any]) -> None:
-        """Enter figures by their top keys in report.json, as the solver records them."""
+        """Set the figures that the solver recorded, by their top-level keys in report.json."""
         for name, value in figures.items():
             if name in _KEYS:
                 setattr(self, name, value)
@@ -229,7 +229,7 @@ class Report:
 
     @property
     def volume_unaccounted_mm3(self) -> float:
-        """Added volume that the balance did not find; negative if it found more. Of reports with a balance only."""
+        """Added volume that neither left the cloud nor compressed it; the report must have a balance."""
         added, pushed, compressed = self.volume_added_mm3, self.volume_pushed_mm3, self.volume_compressed_mm3
         assert added is not None
         assert pushed is not None
@@ -238,7 +238,7 @@ class Report:
 
 
 def _finite(value: Any) -> Any:
-    """The value with None for the numbers that JSON does not have."""
+    """The value with None instead of numbers that are not finite, which JSON does not have."""
     if isinstance(value, Mapping):
         return {name: _finite(inner) for name, inner in value.items()}
     if isinstance(value, list):
@@ -250,9 +250,9 @@ def _finite(value: Any) -> Any:
 _KEYS: dict[str, str] = {}
 FIGURES: list[Figure] = []
 for _name, _hint in get_type_hints(Report, include_extras=True).items():
-    _declared = [of for of in getattr(_hint, "__metadata__", ()) if isinstance(of, Figure)]
-    _KEYS[_name] = next((of.key for of in _declared if of.key), _name)
-    FIGURES += [replace(of, key=f"{_KEYS[_name]}.{of.part}".removesuffix(".")) for of in _declared if of.label]
+    _declared = [entry for entry in getattr(_hint, "__metadata__", ()) if isinstance(entry, Figure)]
+    _KEYS[_name] = next((figure.key for figure in _declared if figure.key), _name)
+    FIGURES += [replace(one, key=f"{_KEYS[_name]}.{one.part}".removesuffix(".")) for one in _declared if one.label]
 del _KEYS["other"]
 #: The first declaration of each key.
 BY_KEY = {figure.key: figure for figure in reversed(FIGURES)}

@@ -30,9 +30,9 @@ class FinalState:
     domain_displacement: _Floats  # (n_domains, 3), m, u_h at integration points
     jacobian: _Floats  # (n_cells,)
     time: float  # s
-    complete: bool  # whether the run came to its end
+    complete: bool  # whether the run reached its end
     metadata: dict[str, Any]  # recorded at the start of the run
-    figures: dict[str, Any]  # recorded at its end; empty if the run was killed
+    figures: dict[str, Any]  # recorded at the end; empty if the run was killed
 
     @property
     def title(self) -> str:
@@ -52,10 +52,10 @@ class FinalState:
 
     @property
     def shown_displacement(self) -> _Floats:
-        """Displacement of pictures (n_nodes, 3), m: the field, and the tumour's surface as prescribed."""
-        shown = self.field.copy()
-        shown[self.seed] = self.displacement[self.seed]
-        return shown
+        """Displacements for pictures (n_nodes, 3), m: the field, but the prescribed displacement on the tumour."""
+        displacement = self.field.copy()
+        displacement[self.seed] = self.displacement[self.seed]
+        return displacement
 
     @cached_property
     def volumes(self) -> _Floats:
@@ -76,8 +76,8 @@ class FinalState:
     def ventricles(self) -> dict[str, NDArray[np.int64]]:
         """Rows (n,) of `Model.hexahedra` in each ventricle of the model, left first."""
         sets = {side: self.model.cell_sets.get(name, np.empty(0, np.int64)) for side, name in VENTRICLES.items()}
-        found = {side: self.model.rows_of("hexahedra", cells) for side, cells in sets.items()}
-        return {side: cells for side, cells in found.items() if len(cells)}
+        rows = {side: self.model.rows_of("hexahedra", cells) for side, cells in sets.items()}
+        return {side: cells for side, cells in rows.items() if len(cells)}
 
     def cell_centre(self, cell: int) -> _Floats:
         """Undeformed centre (3,) of a cell, m."""
@@ -86,14 +86,14 @@ class FinalState:
         return np.asarray(block.columns["points"][row] if block.kind.meshfree else nodes.mean(axis=0))
 
     def cell_kind(self, cell: int) -> str:
-        """Name of a cell's kind."""
+        """Name of a cell's kind, such as "hexahedron"."""
         return self.model.find_cell(cell)[0].kind.singular
 
 
 def read(directory: Path) -> FinalState:
-    """The last frame of the run in a directory, and its model; both in one folder.
+    """Read the last frame and the model of the run in a directory.
 
-    InputError if the directory holds no result, or the result and the model do not belong together.
+    InputError if the directory has no result, or if result and model do not belong together.
     """
     if not directory.is_dir():
         raise InputError(f"{directory}: is not a folder; give the folder that 'mpitled run' wrote")

@@ -1,4 +1,4 @@
-"""HTML pages that are one file each: all text is escaped, pictures are embedded, and nothing is fetched or executed."""
+"""HTML pages in one file each: all text is escaped, pictures are embedded, and nothing is fetched or executed."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-#: Browsers enforce that a page is one file.
+#: With this policy browsers refuse everything that is not in the page itself.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A picture in a page, with its description for readers who do not see it."""
+    """A picture in a page; `alt` is the description for readers who cannot see the picture."""
 
     png: bytes
     alt: str
@@ -25,7 +25,7 @@ class Picture:
 
 
 def render(template: str, **context: Any) -> str:
-    """The page that a template makes of its variables; the templates are in the folder `templates`."""
+    """The HTML text of a template in the folder `templates`, filled in with its variables."""
     environment = Environment(
         loader=PackageLoader("mpitled.results"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True,
@@ -49,12 +49,12 @@ def _filled(sections: Sequence[tuple[str, Markup]]) -> list[tuple[str, Markup]]:
 
 
 def _breakable(heading: str) -> Markup:
-    """The heading with places after the dots of a deck's key where a line may break."""
+    """The heading with a possible line break after each dot of a deck's key."""
     return Markup(re.sub(r"(?<=[a-z])\.(?=\w)|(?<=\w)\.(?=[a-z])", ".<wbr>", str(escape(heading))))
 
 
 def _number_columns(rows: Sequence[Sequence[str]]) -> list[bool]:
-    """Whether all cells of a column are numbers or empty; shorter rows do not count."""
+    """Whether all cells of each column are numbers or empty; shorter rows are ignored."""
     width = max(map(len, rows), default=0)
     return [all(map(_is_number, column)) for column in zip(*(row for row in rows if len(row) == width), strict=True)]
 

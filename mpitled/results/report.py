@@ -1,7 +1,7 @@
 """The report of a run, in the user's units: report.json, a table for the terminal, and pictures.
 
-All displacements are those of the field u_h, which at EFG nodes is not their parameter. The surface of a tumour, which
-moves as prescribed, is the exception: both of its volumes are reported.
+All displacements are values of the field u_h, which differs from the parameters at EFG nodes. The tumour is reported
+with two volumes: its nodes move as prescribed, and the field at these nodes differs a little.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from mpitled.results.final_state import FinalState, read
 REPORT, PAGE = "report.json", "report.html"
 #: Displacements above this are large (paper, 6.2), m.
 LARGE = 5e-3
-#: The report warns if hourglass control and stabilisation have more than this share of the internal energy. Right
-#: results had up to 0.15, wrong ones 0.3 or more.
+#: The report warns if hourglass control and stabilisation have more than this share of the internal energy. The share
+#: was at most 0.15 in correct results, and at least 0.3 in wrong ones.
 MAX_ARTIFICIAL_ENERGY = 0.2
 #: Materials with a larger Poisson's ratio are nearly incompressible.
 NEARLY_INCOMPRESSIBLE = 0.495
-#: Cells with a smaller J lost much of their volume. The report warns if their volume is more than this share of the
-#: tumour's.
+#: Cells with a smaller J lost much of their volume. The report warns if the volume of such cells is more than this
+#: share of the tumour's.
 LOW_JACOBIAN, MAX_LOW_JACOBIAN_VOLUME = 0.5, 0.02
-#: Gauss points, exact to degree 3 in each coordinate; the volume integrand of a bilinear face has degree 2.
+#: Gauss points: exact to degree 3 in each coordinate, and the volume integrand of a bilinear face has degree 2.
 _GAUSS = (-(3**-0.5), 3**-0.5)
 
 _Floats = NDArray[np.float64]
@@ -44,48 +44,47 @@ _Floats = NDArray[np.float64]
 
 
 def write(directory: Path, seconds: Mapping[str, float] | None = None) -> dict[str, Any]:
-    """Make the report of the run in a directory and write report.json; the content of report.json.
+    """Make the report of the run in a directory, and write and return the content of report.json.
 
-    Errors are those of `make` and `keep`.
+    Errors are those of `make` and `save`.
     """
     report = make(directory, seconds).as_json()
-    keep(directory, report)
+    save(directory, report)
     return report
 
 
 def make(directory: Path, seconds: Mapping[str, float] | None = None) -> Report:
-    """Compute the report of the run in a directory, and draw its pictures there if the directory can be written.
+    """Compute the report of the run in a directory, and draw its pictures there if the directory is writable.
 
-    `seconds` are the phases of a run that ends now. InputError if the directory holds no result, or the result and the
-    model do not belong together.
+    `seconds` are the durations of the phases, if the run ends now. InputError if the directory has no result, or if
+    result and model do not belong together.
     """
     begin = time.perf_counter()
-    directory = Path(directory)
     state = read(directory)
     report = compute(state)
     report.pictures = _draw(state, directory)
-    phases = dict(seconds or report.seconds or {})
-    took = {"report": time.perf_counter() - begin} if seconds else _first_report(directory, phases)
-    report.seconds = phases | took
+    phases = dict(seconds or report.seconds)
+    own = {"report": time.perf_counter() - begin} if seconds else _report_seconds(directory, phases)
+    report.seconds = phases | own
     return report
 
 
-def _first_report(directory: Path, phases: Mapping[str, float]) -> dict[str, float]:
-    """Time of the report at the end of the run, which a later report of the same run keeps."""
+def _report_seconds(directory: Path, phases: Mapping[str, float]) -> dict[str, float]:
+    """The duration of the report at the end of the run, from report.json; a later report of the run repeats it."""
     try:
-        kept = dict(json.loads((directory / REPORT).read_text(encoding="utf-8"))["seconds"])
+        old = dict(json.loads((directory / REPORT).read_text(encoding="utf-8"))["seconds"])
     except (OSError, ValueError, KeyError, TypeError):
         return {}
-    return {"report": kept["report"]} if kept.keys() - phases.keys() == {"report"} else {}
+    return {"report": old["report"]} if old.keys() - phases.keys() == {"report"} else {}
 
 
-def keep(directory: Path, report: Mapping[str, Any]) -> None:
+def save(directory: Path, report: Mapping[str, Any]) -> None:
     """Write report.json into the run's directory. InputError if the file cannot be written."""
     atomic.write_text(directory / REPORT, json.dumps(report, indent=2, allow_nan=False) + "\n")
 
 
 def _draw(state: FinalState, directory: Path) -> list[str] | str:
-    """Names of the pictures that were drawn, or why there are none."""
+    """Names of the pictures that were drawn, or the reason why there are none."""
     if not state.metadata.get("deck", {}).get("output", {}).get("pictures", True):
         return "none, because output.pictures is false"
     try:
@@ -100,17 +99,17 @@ def _draw(state: FinalState, directory: Path) -> list[str] | str:
 
 
 def incomplete(report: Mapping[str, Any]) -> str:
-    """The last frame of a run that did not come to its end, and the reason if the run recorded it."""
+    """The last frame of a run that did not reach its end, and the reason if the run recorded it."""
     stopped = f"; {report['stopped']}" if "stopped" in report else ""
     return f"not complete: the last frame is at {report['load_share']:.1%} of the load{stopped}"
 
 
-def table(report: Mapping[str, Any], *, whole: bool = True) -> str:
-    """The content of report.json as a table for the terminal, or its headlines only."""
+def table(report: Mapping[str, Any], *, full: bool = True) -> str:
+    """The content of report.json as a table for the terminal: all figures, or the headlines."""
     lines = [report["title"]] if report["title"] else []
     if not report["complete"]:
         lines.append(incomplete(report))
-    lines += [f"  {name:<47}  {value}" for name, value in rows(report, headlines=not whole)]
+    lines += [f"  {name:<47}  {value}" for name, value in rows(report, headlines=not full)]
     lines += [f"  warning: {text}" for text in report["warnings"]]
     pictures = report["pictures"]
     lines.append(f"  {'pictures':<47}  {', '.join(pictures) if isinstance(pictures, list) else pictures}")
@@ -121,7 +120,7 @@ def table(report: Mapping[str, Any], *, whole: bool = True) -> str:
 
 
 def compute(state: FinalState) -> Report:
-    """The report of a state, without pictures and phases."""
+    """The report of a state, without pictures and durations of phases."""
     report = Report(
         title=state.metadata.get("title", ""),
         complete=state.complete,
@@ -134,7 +133,7 @@ def compute(state: FinalState) -> Report:
         report.method = solver["method"]
         if report.method == RELAXATION:
             report.time_step_s = None  # the time of relaxation is fictitious
-    # The figures of a run that was stopped are wrong for that reason: further warnings would mislead.
+    # The figures of a stopped run are wrong because it was stopped: further warnings would be misleading.
     report.warnings = [*state.model.warnings, *(_warnings(report, state.model) if state.complete else ())]
     return report
 
@@ -152,7 +151,7 @@ def _displacements(report: Report, state: FinalState) -> None:
 
 
 def _outside_first_ring(state: FinalState) -> _Floats:
-    """Displacements (n, 3), m, at the nodes and integration points of no cell that has a node of the tumour."""
+    """Displacements (n, 3), m, at the nodes and integration points that belong to no cell with a node of the tumour."""
     model = state.model
     on_seed = np.zeros(model.n_nodes, bool)
     on_seed[state.seed] = True
@@ -166,8 +165,8 @@ def _outside_first_ring(state: FinalState) -> _Floats:
 def _cloud(report: Report, state: FinalState) -> None:
     """Residuals of moving least squares at the EFG nodes.
 
-    Where they are large the polynomials cannot follow the field. In 14 grown spheres the error of the field was 0.8 to
-    3.8 times the residual.
+    A large residual means that the polynomials cannot represent the field. In 14 grown spheres the error of the field
+    was 0.8 to 3.8 times the residual.
     """
     misfit = np.linalg.norm((state.field - state.displacement)[state.model.n_fe_nodes :], axis=1)
     if len(misfit):
@@ -176,7 +175,7 @@ def _cloud(report: Report, state: FinalState) -> None:
 
 
 def _ventricles(report: Report, state: FinalState) -> None:
-    """Volumes of the ventricles, their changes (negative if they shrink), and displacements of their walls."""
+    """Volumes of the ventricles, changes of the volumes (negative: smaller), and displacements of the walls."""
     model, undeformed = state.model, state.hexahedron_volumes
     before, change, wall = {}, {}, {}
     for side, cells in state.ventricles.items():
@@ -195,27 +194,27 @@ def _ventricles(report: Report, state: FinalState) -> None:
 def _midline_shift(state: FinalState) -> float | None:
     """Largest displacement across the midline of the tissue between the ventricles, mm; positive to the right.
 
-    The midline's plane is half-way between the centres of the ventricles and normal to the line through them. The nodes
-    within half a hexahedron of this plane count that lie within the ventricles' extent along the plane. None without
-    two ventricles.
+    The plane of the midline is half-way between the centres of the ventricles, and normal to the line between them. The
+    tissue is that of the nodes within half a hexahedron of the plane, and within the bounds of the ventricles' nodes
+    after projection onto the plane. None without two ventricles.
     """
     model, sides = state.model, state.ventricles
     if len(sides) < 2:
         return None
     nodes = [np.unique(model.hexahedra[cells]) for cells in sides.values()]
-    left, right = (model.points[of].mean(axis=0) for of in nodes)
-    across = (right - left) / np.linalg.norm(right - left)
-    from_plane = model.points @ across - (left + right) @ across / 2
-    projected = model.points - np.outer(model.points @ across, across)
+    left, right = (model.points[one].mean(axis=0) for one in nodes)
+    normal = (right - left) / np.linalg.norm(right - left)
+    from_plane = model.points @ normal - (left + right) @ normal / 2
+    projected = model.points - np.outer(model.points @ normal, normal)
     both = projected[np.concatenate(nodes)]
     between = ((projected >= both.min(axis=0)) & (projected <= both.max(axis=0))).all(axis=1)
     near = np.abs(from_plane) <= float(np.cbrt(state.hexahedron_volumes.mean())) / 2
-    shifts = (state.field @ across)[between & near]
+    shifts = (state.field @ normal)[between & near]
     return 1e3 * float(shifts[np.abs(shifts).argmax()]) if len(shifts) else None
 
 
 def _jacobians(report: Report, state: FinalState) -> None:
-    """The smallest J in the last frame and its cell, and the volume of cells with a low J."""
+    """The smallest J in the last frame with its cell, and the volume of cells with a low J."""
     cell, low = int(np.argmin(state.jacobian)), state.jacobian < LOW_JACOBIAN
     report.smallest_jacobian = LowestJacobian(
         now=float(state.jacobian[cell]),
@@ -228,10 +227,10 @@ def _jacobians(report: Report, state: FinalState) -> None:
 
 
 def _tumour(report: Report, state: FinalState) -> None:
-    """Volume of the tumour by its nodes and by the field at them, and the balance of the added volume.
+    """Volume of the tumour from its nodes and from the field at these nodes, and the balance of the added volume.
 
-    The volume is that of the sphere of which the nodes are a sample, (4 pi / 3) mean r^3: the hull of the nodes lacks
-    the caps between them. Its integral of r^3 over the solid angle also holds for the uneven surface of the field.
+    The volume is (4 pi / 3) mean r^3 of the nodes, the integral of r^3 / 3 over the solid angle. This holds for a
+    sphere and for the uneven surface of the field. The convex hull of the nodes would be too small.
     """
     model, seed, centre = state.model, state.seed, state.centre
     if centre is None or not len(seed):
@@ -241,13 +240,13 @@ def _tumour(report: Report, state: FinalState) -> None:
         cubes = np.linalg.norm(model.points[seed] + displacement[seed] - centre, axis=1) ** 3
         return 4 / 3 * math.pi * float(cubes.mean())
 
-    reached = volume(state.displacement)
-    report.tumour_volume_mm3 = 1e9 * reached
+    final = volume(state.displacement)
+    report.tumour_volume_mm3 = 1e9 * final
     report.tumour_volume_by_field_mm3 = 1e9 * volume(state.field)
     interface = model.node_sets.get("interface", np.empty(0, np.int64))
     faces = interface_faces(model.points, model.hexahedra, interface, model.domain_points)
     if len(faces) and not np.any(state.field[_open_edge_nodes(faces)]):
-        added = reached - 4 / 3 * math.pi * state.metadata["tumour"]["seed_radius_m"] ** 3
+        added = final - 4 / 3 * math.pi * state.metadata["tumour"]["seed_radius_m"] ** 3
         pushed = enclosed_volume(model.points, faces) - enclosed_volume(model.points + state.field, faces)
         compressed = float((model.domain_volumes * (1 - state.jacobian[model.cells_of("support domains")])).sum())
         report.volume_added_mm3 = 1e9 * added
@@ -257,9 +256,10 @@ def _tumour(report: Report, state: FinalState) -> None:
 
 
 def enclosed_volume(points: _Floats, faces: NDArray[np.int64]) -> float:
-    """Volume (m^3) inside a closed surface of bilinear faces (n, 4), anticlockwise seen from outside; exact.
+    """Exact volume (m^3) inside a closed surface of bilinear faces (n, 4), anticlockwise seen from outside.
 
-    It is (1/3) of the integral of x . n. The faces of trilinear hexahedra are bilinear, so volumes add up to round-off.
+    The volume is 1/3 of the surface integral of x . n. Faces of trilinear hexahedra are bilinear, so the volumes inside
+    and outside agree to round-off.
     """
     a, b, c, d = np.moveaxis(points[faces], 1, 0)
     total = 0.0
@@ -273,11 +273,10 @@ def enclosed_volume(points: _Floats, faces: NDArray[np.int64]) -> float:
 
 
 def _open_edge_nodes(faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Nodes where a surface of faces (n, 4) ends: on edges that no other face has in the opposite direction."""
+    """Nodes on the rim of a surface of faces (n, 4): on edges that no other face has in the opposite direction."""
     edges = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
     base = int(faces.max()) + 1
-    forth, back = edges[:, 0] * base + edges[:, 1], edges[:, 1] * base + edges[:, 0]
-    return np.unique(edges[~np.isin(forth, back)])
+    return np.unique(edges[~np.isin(edges @ [base, 1], edges @ [1, base])])
 
 
 # --- warnings ------------------------------------------------------------------------------------------------------
@@ -288,7 +287,7 @@ def _warnings(report: Report, model: Model) -> Iterator[str]:
     yield from _artificial_energy(report, model)
     yield from _volume_warnings(report)
     if report.cloud_misfit_mm is not None and _is_over("cloud_misfit_mm", report.cloud_misfit_mm):
-        # Next to a grown seed the spacing on its surface decides, and a finer cloud behind it changes little.
+        # Next to a grown seed the spacing of the nodes on its surface decides; a finer cloud elsewhere changes little.
         grown = report.volume_error is not None
         remedy = "raise tumour.surface_nodes: four times as many halve it" if grown else "lower cloud.spacing"
         yield (
@@ -310,7 +309,7 @@ def _artificial_energy(report: Report, model: Model) -> Iterator[str]:
         return
     share = (energy["hourglass"] + energy["stabilisation"]) / energy["internal"]
     if share > MAX_ARTIFICIAL_ENERGY:
-        # The stiffness of these modes is a share of lambda + 2 mu, which is unbounded towards a ratio of 0.5.
+        # The stiffness of these modes is a share of lambda + 2 mu, which tends to infinity at a ratio of 0.5.
         stiff = max(material.poissons_ratio for material in model.materials) > NEARLY_INCOMPRESSIBLE
         remedy = "lower material.NAME.poissons_ratio (0.49)" if stiff else "raise support.stabilisation"
         yield (
@@ -332,7 +331,7 @@ def _volume_warnings(report: Report) -> Iterator[str]:
     if low > MAX_LOW_JACOBIAN_VOLUME * tumour:
         yield (
             f"{low:.3g} mm3 of tissue, {low / tumour:.1%} of the tumour's volume, is in cells that lost more than half "
-            "of their volume: beside the tumour the field is not to be trusted; refine the cloud there (cloud.growth)"
+            "of their volume: the field beside the tumour is not to be trusted; refine the cloud there (cloud.growth)"
         )
 
 
