@@ -82,18 +82,28 @@ def inline_template(function: Any) -> Any:
     return function
 
 
+class CompiledKernel:
+    """A kernel of cells; calls go through this class so that a dry run can trace them."""
+
+    __slots__ = ("function",)
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function: Any = function
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.function(*arguments)
+
+
 @cache
-def compile_for(template: Any, law: type[Law]) -> Callable[..., Any]:
+def compile_for(template: Any, law: type[Law]) -> CompiledKernel:
     """The kernel of a template with the formulas of a law.
 
     The functions are those of the modules with other globals, and not closures: numba finds closures in its cache on
     the disk in no later process.
     """
     formulas = {f"law_{name}": inline(getattr(law, name)) for name in ("stress", "energy", "tangent_bound")}
-    compiled: Callable[..., Any] = kernel(
-        _with_globals(template, law, formulas | {"N_COEFFICIENTS": law.n_coefficients})
-    )
-    return compiled
+    names = formulas | {"N_COEFFICIENTS": law.n_coefficients}
+    return CompiledKernel(kernel(_with_globals(template, law, names)))
 
 
 def _with_globals(function: FunctionType, law: type[Law], names: dict[str, Any]) -> FunctionType:

@@ -13,6 +13,7 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from mpitled import kernels
+from mpitled.kernels.templates import CompiledKernel
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,14 +56,22 @@ def trace_kernels(terms: Sequence[tuple[str, Callable[[], object]]]) -> list[Cal
 
         return call
 
+    def call_of_cells(compiled: CompiledKernel, *arguments: Any) -> Any:
+        function = compiled.function.py_func
+        cells = function.__module__.rpartition(".")[2]
+        return traced(f"{cells}.{function.__name__.removesuffix('_template')}", compiled.function)(*arguments)
+
     originals = {name: getattr(kernels, name) for name in kernel_names()}
+    original_call: Any = CompiledKernel.__call__
     try:
+        CompiledKernel.__call__ = call_of_cells  # type: ignore[assignment, method-assign]
         for name, kernel in originals.items():
             setattr(kernels, name, traced(name, kernel))
         for current, execute in terms:
             term = current
             execute()
     finally:
+        CompiledKernel.__call__ = original_call  # type: ignore[method-assign]
         for name, kernel in originals.items():
             setattr(kernels, name, kernel)
     return calls
