@@ -270,7 +270,7 @@ def test_an_undeformed_body_is_where_it_was(run):
     still = field.open_field(run.folder, 0)
     places = 1e-3 * run.places[(run.before > 0) & (np.linalg.norm(run.places - CENTRE, axis=3) > SEED)]
     origins = still.origins(places)
-    np.testing.assert_allclose(origins.place, places, rtol=0, atol=1e-6)  # where Newton is content
+    np.testing.assert_allclose(origins.position, places, rtol=0, atol=1e-6)  # where Newton is content
     assert origins.missed.max() <= 1e-6
 
 
